@@ -50,7 +50,7 @@ def decide(motion: GivenMotion, kept: Sequence[Kept]) -> dict[str, Decision]:
 
 @dataclass
 class _Edge:
-    """Pairs (P,) at instants: points (P, 4, 3), distances (P,), m, normals (P, 3), and the gaps of their planes, m."""
+    """Pairs (P,) at instants: points (P, 2 V, 3), distances (P,), m, normals (P, 3), and the gaps of their planes, m."""
 
     points: Array
     distance: Array
@@ -58,8 +58,8 @@ class _Edge:
     held: Array
 
     @staticmethod
-    def none() -> _Edge:
-        return _Edge(np.zeros((0, 4, 3)), np.zeros(0), np.zeros((0, 3)), np.zeros(0))
+    def none(points: int) -> _Edge:
+        return _Edge(np.zeros((0, points, 3)), np.zeros(0), np.zeros((0, 3)), np.zeros(0))
 
     @staticmethod
     def joined(parts: Sequence[_Edge]) -> _Edge:
@@ -179,7 +179,7 @@ class Bisection:
         """Return (I,) the gap, m, that the better of the two edges' planes holds at both edges."""
         others = self._apart(
             np.repeat(pair, 2),
-            np.stack([last.points, first.points], axis=1).reshape(-1, 4, 3),
+            np.stack([last.points, first.points], axis=1).reshape(-1, *first.points.shape[1:]),
             np.stack([first.normal, last.normal], axis=1).reshape(-1, 3),
         )
         held = np.minimum(np.stack([first.held, last.held], axis=1), others.reshape(-1, 2))
@@ -197,7 +197,7 @@ class Bisection:
         segment = np.minimum(instants.astype(np.int64), len(self.motion.time) - 2)
         ends = self.motion.ends_at(segment, instants - segment)
         time = self.motion.times_at(segment, instants - segment)
-        parts = [_Edge.none()]
+        parts = [_Edge.none(2 * ends.shape[2])]
         for own, rows in self._groups(pair):
             parts.append(_edge_of(own, self._pair(pair[rows]), ends, time, which[rows]))
         edge = _Edge.joined(parts)
@@ -268,7 +268,8 @@ class Bisection:
             for state, pair in own.enclosed():
                 states.setdefault(pair, []).append(state)
             for (first, second), found in states.items():
-                depth = -float(own.depth((np.array([first]), np.array([second])))[0])
+                one = np.array([first]), np.array([second])
+                depth = -float(np.minimum(own.depth(one), self.motion.arm.length[first])[0])
                 decision.bound = min(decision.bound, depth)
                 start, end = float(time[found[0]]), float(time[found[-1]])
                 yield Finding(start, end, kind, own.names((first, second)), depth, floor, start)

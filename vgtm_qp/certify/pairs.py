@@ -11,6 +11,7 @@ import numpy as np
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.certify.motion import GivenMotion
 from vgtm_qp.verify.clearance import AgainstMembers, Pairs, box_gap
+from vgtm_qp.verify.convex import hull_distance
 from vgtm_qp.verify.distance import Separation
 from vgtm_qp.verify.obstacles import Body
 
@@ -55,9 +56,9 @@ class Kept(ABC):
 
     @abstractmethod
     def points(self, pair: Pairs, ends: Callable[[Index], Array], time: Array) -> Array:
-        """Return (P, 4, 3) the points that the pairs' distances depend on, m.
+        """Return (P, 2 V, 3) the points that the pairs' distances depend on, m.
 
-        `ends` gives (P, 2, 3) the ends of bodies (P,) of the arm at the times (P,), s.
+        `ends` gives (P, V, 3) the ends of bodies (P,) of the arm at the times (P,), s.
         """
 
     @abstractmethod
@@ -70,7 +71,7 @@ class Kept(ABC):
 
     @abstractmethod
     def depth(self, pair: Pairs) -> Array:
-        """Return (P,) the greatest depth of penetration that distances can have, m: the radii."""
+        """Return (P,) the greatest depth of penetration that distances can have, m: the radii; infinite for hulls."""
 
     @abstractmethod
     def bend(self, segment: Index, pair: Pairs) -> Array:
@@ -188,17 +189,27 @@ class KeptBodies(Kept):
 
     def separation(self, points: Array, pair: Pairs) -> Separation:
         """See ``Kept``; normals are in the pieces' own frames."""
-        distance, normal = self._shape.distance(points[:, 0], points[:, 1], self._sizes[pair[1]])
-        return distance - self.depth(pair), normal
+        shape, sizes = self._shape, self._sizes[pair[1]]
+        distance, normal = shape.distance(points[:, 0], points[:, 1], sizes)
+        hull = self.motion.arm.is_hull[pair[0]]
+        if hull.any():
+            vertices, of_hulls = points[hull, : points.shape[1] // 2], sizes[hull]
+            distance[hull], normal[hull] = hull_distance(
+                vertices, lambda normal, rows: shape.furthest(normal, of_hulls[rows])
+            )
+        return distance - self.motion.arm.radius[pair[0]], normal
 
     def apart(self, points: Array, normal: Array, pair: Pairs) -> Array:
         """See ``Kept``."""
-        nearest = np.einsum("pec,pc->pe", points[:, :2], normal).min(axis=1)
-        return np.asarray(nearest - self._shape.reach(normal, self._sizes[pair[1]]) - self.depth(pair))
+        vertices = points[:, : points.shape[1] // 2]
+        nearest = np.einsum("pec,pc->pe", vertices, normal).min(axis=1)
+        reach = self._shape.reach(normal, self._sizes[pair[1]])
+        return np.asarray(nearest - reach - self.motion.arm.radius[pair[0]])
 
     def depth(self, pair: Pairs) -> Array:
         """See ``Kept``."""
-        return np.asarray(self.motion.arm.radius[pair[0]])
+        arm = self.motion.arm
+        return np.where(arm.is_hull[pair[0]], np.inf, arm.radius[pair[0]])
 
     def bend(self, segment: Index, pair: Pairs) -> Array:
         """See ``Kept``: obstacles go straight."""
@@ -231,7 +242,7 @@ class KeptMembers(Kept):
     def _gaps(self, segments: slice) -> Array:
         low, high, (first, second) = self._low[segments], self._high[segments], self._pair
         gaps = box_gap(low[:, first], high[:, first], low[:, second], high[:, second])
-        return np.asarray(gaps - self.depth(self._pair))
+        return np.asarray(gaps - self._against.radii(self._pair))
 
     def _near(self, segment: Index, column: Index, gap: Array, limit: float) -> Near:  # noqa: ARG002
         return Near(segment, (self._pair[0][column], self._pair[1][column]), gap)
@@ -250,7 +261,7 @@ class KeptMembers(Kept):
 
     def depth(self, pair: Pairs) -> Array:
         """See ``Kept``."""
-        return self._against.radii(pair)
+        return np.where(self._against.with_hull(pair), np.inf, self._against.radii(pair))
 
     def bend(self, segment: Index, pair: Pairs) -> Array:
         """See ``Kept``."""

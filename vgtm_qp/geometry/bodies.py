@@ -1,24 +1,106 @@
-"""The bodies of an arm, and what it carries: capsules, each spanned by two points."""
+"""The bodies of an arm, and what it carries: capsules and convex hulls, each spanned by points of the arm."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from vgtm_qp.arrays import Array, Index, Mask
 
+_CAPSULE, _HULL = 2, 4
+"""Numbers of points that span a capsule and a hull."""
+
+_ROOM = 1e-6
+"""Share of its size by which a simplex is larger than what it encloses."""
+
 
 @dataclass(frozen=True, eq=False)
-class Bodies:
-    """B capsules between points of an arm; make them by :func:`capsules`.
+class Hull:
+    """A convex polytope that moves with four points of an arm, the corners of a simplex that encloses it.
+
+    Each of its points is a mean of the four with weights of at least zero, so that no point of it moves further
+    than one of them.
 
     Attributes
     ----------
-    points : (B, 2) int
-        The two points that span each capsule: rows of the positions (P, 3).
+    simplex : (4, 3)
+        Places of the four points, m, in any frame.
+    vertices : (V, 3)
+        In that frame, m.
+    weights : (V, 4)
+        Of the four points in each vertex; a row's sum is 1.
+    faces : (F, 3) int
+        Triangles of its surface, counter-clockwise seen from outside.
+    normals : (K, 3)
+        Outward unit normals of its faces.
+    size : float
+        Length of the diagonal of a box round it, m.
+    """
+
+    simplex: Array
+    vertices: Array
+    weights: Array
+    faces: Index
+    normals: Array
+    size: float
+
+    @classmethod
+    def of(cls, points: ArrayLike) -> Hull:
+        """Return the hull of points (K, 3), m.
+
+        Raises
+        ------
+        ValueError
+            All points are nearly in one plane.
+        """
+        from scipy.spatial import ConvexHull, QhullError
+
+        given = np.asarray(points, dtype=float)
+        try:
+            found = ConvexHull(given)
+        except (QhullError, ValueError) as error:
+            raise ValueError("the points do not span a volume") from error
+        vertices = given[found.vertices]
+        number = np.empty(len(given), dtype=np.int64)
+        number[found.vertices] = np.arange(len(vertices))
+        faces, outward = number[found.simplices], found.equations[:, :3]
+        a, b, c = np.moveaxis(vertices[faces], 1, 0)
+        inward = np.einsum("fc,fc->f", np.cross(b - a, c - a), outward) < 0.0
+        faces[inward] = faces[inward][:, [0, 2, 1]]
+        normals = outward[np.unique(np.round(outward, 9), axis=0, return_index=True)[1]]
+        simplex = _simplex(vertices)
+        corners = np.concatenate([simplex.T, np.ones((1, _HULL))])
+        weights = np.linalg.solve(corners, np.concatenate([vertices.T, np.ones((1, len(vertices)))])).T
+        size = float(np.linalg.norm(np.ptp(vertices, axis=0)))
+        return cls(simplex, vertices, weights, faces, normals, size)
+
+
+def _simplex(points: Array) -> Array:
+    """Return the corners (4, 3) of a simplex that encloses points (K, 3), along their principal axes, m."""
+    axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
+    own = points @ axes.T
+    low, size = own.min(axis=0), np.ptp(own, axis=0)
+    room = _ROOM * float(size.max())
+    corners = low - room + np.vstack([np.zeros(3), np.diag(3.0 * size + 9.0 * room)])
+    return np.asarray(corners @ axes)
+
+
+@dataclass(frozen=True, eq=False)
+class Bodies:
+    """B bodies spanned by points of an arm; make them by :func:`capsules` or :func:`convex_bodies`.
+
+    A body is the set of all points within its radius of the convex hull of its vertices: those of its hull, or the
+    two ends of the axis of a capsule.
+
+    Attributes
+    ----------
+    points : (B, E) int
+        The points that span each body, rows of the positions (P, 3): the two ends of capsules if all are capsules;
+        else four, those of the hull's simplex, or the ends of a capsule twice.
     radius : (B,)
         m.
     joints : (B, 2) int
@@ -30,6 +112,8 @@ class Bodies:
         Further pairs that may touch.
     carried : int
         Number of the last ones that belong to what the arm carries.
+    hulls : tuple of Hull or None
+        The hulls of bodies, None for capsules; empty if all are capsules.
     """
 
     points: Index
@@ -39,9 +123,33 @@ class Bodies:
     kind: str
     touching: Index = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
     carried: int = 0
+    hulls: tuple[Hull | None, ...] = ()
 
     def __len__(self) -> int:
         return len(self.points)
+
+    @property
+    def is_hull(self) -> Mask:
+        """(B,) bool, False for capsules."""
+        if not self.hulls:
+            return np.zeros(len(self), dtype=bool)
+        return np.array([hull is not None for hull in self.hulls], dtype=bool)
+
+    @cached_property
+    def weights(self) -> Array:
+        """(B, V, 4) weights of the four points of each body in its vertices, some of which stand there several times."""
+        most = max((len(hull.vertices) for hull in self.hulls if hull is not None), default=_CAPSULE)
+        every = np.arange(most)
+        weights = np.tile(np.eye(_HULL)[every % _CAPSULE], (len(self), 1, 1))
+        for body, hull in enumerate(self.hulls):
+            if hull is not None:
+                weights[body] = hull.weights[every % len(hull.vertices)]
+        return weights
+
+    @cached_property
+    def sizes(self) -> Array:
+        """(B,) sizes of the hulls, m; zero for capsules."""
+        return np.array([0.0 if hull is None else hull.size for hull in self.hulls])
 
     def may_touch(self, first: Index, second: Index) -> Mask:
         """Return (P,) which pairs of bodies are neighbours or :attr:`touching`."""
@@ -58,6 +166,28 @@ class Bodies:
         kind = self.kind if body < len(self) - self.carried else "carried"
         return f"{kind} {self.names[body]}"
 
+    def some(self, X: Array) -> Array:
+        """Return (B, 2, 3) two points of each body without its radius, for points at `X` (P, 3), m."""
+        ends = X[self.points[:, :_CAPSULE]]
+        for body in np.flatnonzero(self.is_hull).tolist():
+            hull = self.hulls[body]
+            assert hull is not None
+            ends[body] = hull.weights[:_CAPSULE] @ X[self.points[body]]
+        return np.asarray(ends)
+
+    def joined(self, ends: Index, radius: Array, joints: Index, names: Sequence[str]) -> Bodies:
+        """Return the bodies and the capsules between `ends` (C, 2) that the arm carries, with their joints (C, 2)."""
+        width = self.points.shape[1]
+        return replace(
+            self,
+            points=np.concatenate([self.points, np.tile(ends, width // _CAPSULE)]),
+            radius=np.concatenate([self.radius, radius]),
+            joints=np.concatenate([self.joints, joints]),
+            names=(*self.names, *names),
+            carried=len(ends),
+            hulls=(*self.hulls, *[None] * len(ends)) if self.hulls else (),
+        )
+
 
 def capsules(
     points: ArrayLike,
@@ -72,7 +202,7 @@ def capsules(
     The radius, m, may be one for all. Names are by default ``"0"``, ``"1"``..., and the joints (B, 2) the points:
     bodies that share a point are neighbours.
     """
-    span = np.asarray(points, dtype=np.int64).reshape(-1, 2)
+    span = np.asarray(points, dtype=np.int64).reshape(-1, _CAPSULE)
     return Bodies(
         points=span,
         radius=np.broadcast_to(np.asarray(radius, dtype=float), len(span)).copy(),
@@ -80,3 +210,23 @@ def capsules(
         names=tuple(map(str, range(len(span)))) if names is None else tuple(names),
         kind=kind,
     )
+
+
+def convex_bodies(
+    points: Sequence[Sequence[int]],
+    hulls: Sequence[Hull | None],
+    radius: ArrayLike,
+    names: Sequence[str],
+    *,
+    joints: ArrayLike,
+    kind: str = "link",
+) -> Bodies:
+    """Return bodies with `hulls`, or capsules where these are None.
+
+    The points are four for a hull, the corners of its simplex in their order, and two for a capsule.
+    """
+    if all(hull is None for hull in hulls):
+        return capsules(np.array(points), radius, names, joints=joints, kind=kind)
+    span = np.array([list(own) * (_HULL // len(own)) for own in points], dtype=np.int64)
+    ends = capsules(span[:, :_CAPSULE], radius, names, joints=joints, kind=kind)
+    return replace(ends, points=span, hulls=tuple(hulls))

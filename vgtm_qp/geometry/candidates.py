@@ -9,6 +9,7 @@ from vgtm_qp.arrays import Array, Index, Mask
 from vgtm_qp.geometry.bodies import Bodies
 from vgtm_qp.geometry.formulas import FAR, FURTHEST
 from vgtm_qp.geometry.groups import Displacement, Group, Scene
+from vgtm_qp.geometry.hulls import groups_of
 from vgtm_qp.geometry.parts import BODIES, Parts
 from vgtm_qp.geometry.shapes import GeometryError
 
@@ -131,7 +132,7 @@ class Candidates:
         self._bending_points = np.zeros(0, dtype=np.int64)
         self._lists[_BENDING].renew([], X, time, np.inf)
         pairs = _near_bodies(X, bodies, np.arange(len(bodies)), horizon)
-        self._lists[_RIGID].renew([Group(self._scene, "segment", *pairs, place=_RIGID)], X, time, horizon)
+        self._lists[_RIGID].renew(groups_of(self._scene, "segment", *pairs, place=_RIGID), X, time, horizon)
 
     def _follow_bodies(self, X: Array, time: float, reach: float, travel: float, horizon: float) -> None:
         """List all pairs of bodies that may come nearer than `reach`, m, while no point moves further than `travel`.
@@ -165,8 +166,8 @@ class Candidates:
         first, second = _near_bodies(X, self._scene.bodies, bodies, horizon)
         # Pairs of two of these parts that do not bend relative to each other are in the list of rigid parts.
         own = parts.among(is_bending, first, second)
-        pairs = Group(self._scene, "segment", first[own], second[own], place=_BENDING)
-        bending.renew([pairs], X, time, horizon)
+        pairs = groups_of(self._scene, "segment", first[own], second[own], place=_BENDING)
+        bending.renew(pairs, X, time, horizon)
 
     def _bending_displacement(self, *states: Array) -> float:
         """Return the greatest distance of a point of a bending part from its reference, m."""
@@ -266,7 +267,8 @@ def _groups_with_pieces(X: Array, scene: Scene, time: float, horizon: float) -> 
     body, piece = _near_pieces(X, scene, time, horizon)
     kinds = pieces.shape[piece]
     shapes = np.unique(pieces.shape).tolist()
-    return [Group(scene, shape, body[kinds == shape], piece[kinds == shape]) for shape in shapes]
+    parts = [(shape, body[kinds == shape], piece[kinds == shape]) for shape in shapes]
+    return [group for part in parts for group in groups_of(scene, *part)]
 
 
 def _moved(states: tuple[Array, ...], reference: Array) -> Array:
@@ -283,7 +285,7 @@ def _near_pieces(X: Array, scene: Scene, time: float, horizon: float) -> tuple[I
     """Return the pairs of a body and a piece that the plane between body and bounding sphere does not separate."""
     pieces, radius = scene.pieces, scene.bodies.radius
     centers = pieces.center + time * pieces.velocity
-    middle, half, longest = _axes(X, scene.bodies.points, radius)
+    middle, half, radius, longest = _axes(X, scene.bodies.points, radius)
     tree = cKDTree(middle, leafsize=BODIES)
     # In the tree's order, so that pairs at equal distances keep that order.
     found = tree.query_ball_point(centers, pieces.radius + longest + horizon, return_sorted=False)
@@ -298,7 +300,7 @@ def _near_pieces(X: Array, scene: Scene, time: float, horizon: float) -> tuple[I
 def _near_bodies(X: Array, bodies: Bodies, among: Index, horizon: float) -> tuple[Index, Index]:
     """Return pairs of some bodies that are not neighbours and that the plane between them does not separate."""
     radius = bodies.radius[among]
-    middle, half, longest = _axes(X, bodies.points[among], radius)
+    middle, half, radius, longest = _axes(X, bodies.points[among], radius)
     first, second = (
         cKDTree(middle).query_pairs(2.0 * longest + horizon, output_type="ndarray").astype(np.int64).T
     )
@@ -312,11 +314,17 @@ def _near_bodies(X: Array, bodies: Bodies, among: Index, horizon: float) -> tupl
     return first[strangers], second[strangers]
 
 
-def _axes(X: Array, points: Index, radius: Array) -> tuple[Array, Array, float]:
-    """Return middles (B, 3) and halves (B, 3) of the axes of bodies, and a bound of a body's reach, m."""
+def _axes(X: Array, points: Index, radius: Array) -> tuple[Array, Array, Array, float]:
+    """Return middles (B, 3) and halves (B, 3) of the axes of bodies, radii, and a bound of a body's reach, m.
+
+    Bodies that four points span are balls: their axes are points.
+    """
     ends = X[points]
-    half = 0.5 * (ends[:, 1] - ends[:, 0])
-    return ends.mean(axis=1), half, float(np.max(np.linalg.norm(half, axis=1) + radius))
+    middle, half = ends.mean(axis=1), 0.5 * (ends[:, 1] - ends[:, 0])
+    if points.shape[1] > 2:
+        radius = radius + np.linalg.norm(ends - middle[:, None], axis=2).max(axis=1)
+        half = np.zeros_like(half)
+    return middle, half, radius, float(np.max(np.linalg.norm(half, axis=1) + radius))
 
 
 def _inseparable(apart: Array, span: Array, room: Array) -> Mask:

@@ -22,7 +22,7 @@ WIDTH = 15
 CONTACT = 9
 """Numbers that describe a contact."""
 
-NORMAL = slice(5, 8)
+NORMAL = slice(-4, -1)
 """The numbers of a contact that are its normal."""
 
 PROOF = 1e-6
@@ -36,6 +36,8 @@ SECOND_CONTACT = 0.2
 
 _LEAST_SQUARE = 0.1
 """Least |n|^2 of a normal between two others that still gives a plane."""
+_MOST_TURNED = 4.0 * (1.0 - _LEAST_SQUARE)
+"""Greatest |n_1 - n_0|^2 of two normals with such a plane all the way between them."""
 
 
 def width(shape: str) -> int:
@@ -198,14 +200,61 @@ def _turning_gap(shape: str, bodies: list[Any], others: list[Any], normals: list
     bound: Any = FAR
     for start, end in points:
         gap = ca.fmin(ca.dot(normals[0], start) - supports[0], ca.dot(normals[1], end) - supports[1])
-        bend = ca.fmax(ca.dot(turn, end - start), 0.0)
-        # (m - c w) / sqrt(1 - k w) falls up to this w and rises after it.
-        lowest = ratio(2.0 * bend - square * gap, bend * square, 1.0)
-        w = ca.fmin(ca.fmax(lowest, 0.0), 0.25)
-        along = (gap - bend * w) / ca.sqrt(ca.fmax(1.0 - square * w, _LEAST_SQUARE))
-        bound = ca.fmin(bound, ca.fmin(gap, along))
+        bound = ca.fmin(bound, _least_gap(gap, ca.dot(turn, end - start), square))
     # Normals that are further apart may be opposite: between them there is no plane.
-    return ca.if_else(square <= 4.0 * (1.0 - _LEAST_SQUARE), bound, -FAR)
+    return ca.if_else(square <= _MOST_TURNED, bound, -FAR)
+
+
+def _least_gap(gap: Any, bend: Any, square: Any) -> Any:
+    """Return the least value of (m - c w) / |n| in :func:`_turning_gap`.
+
+    `gap` is m, `bend` the product of which c is the part above 0, `square` |n_1 - n_0|^2.
+    """
+    bend = ca.fmax(bend, 0.0)
+    # (m - c w) / sqrt(1 - k w) falls up to this w and rises after it.
+    lowest = ratio(2.0 * bend - square * gap, bend * square, 1.0)
+    w = ca.fmin(ca.fmax(lowest, 0.0), 0.25)
+    along = (gap - bend * w) / ca.sqrt(ca.fmax(1.0 - square * w, _LEAST_SQUARE))
+    return ca.fmin(gap, along)
+
+
+@cache
+def turning_function(_: str) -> ca.Function:
+    """Return :func:`_least_gap` as a function, whatever the shape.
+
+    Input ``known (3,)``: gap, bend and square. Output ``bound (1,)``, minus ``FAR`` where there is no plane.
+    """
+    known = ca.SX.sym("known", 3)
+    bound = ca.if_else(known[2] <= _MOST_TURNED, _least_gap(known[0], known[1], known[2]), -FAR)
+    return ca.Function("turning", [known], [bound], ["known"], ["bound"])
+
+
+@cache
+def support_function(shape: str) -> ca.Function:
+    """Return the point of a piece that is furthest along a direction.
+
+    Inputs ``piece (15,)`` and ``normal (3,)``, a unit vector. Output ``point (3,)``, m.
+    """
+    piece, normal = ca.SX.sym("piece", WIDTH), ca.SX.sym("normal", 3)
+    if shape == "triangle":
+        corners = [piece[i : i + 3] for i in (0, 3, 6)]
+        point = corners[0]
+        for corner in corners[1:]:
+            point = ca.if_else(ca.dot(normal, corner - point) > 0.0, corner, point)
+    elif shape == "sphere":
+        point = piece[:3] + piece[12] * normal
+    else:
+        turn = ca.reshape(piece[3:12], 3, 3)
+        own = turn @ normal
+        if shape == "box":
+            furthest = ca.sign(own) * piece[12:15]
+        else:
+            rim = ratio(piece[12], norm(own[:2])) * own[:2]
+            furthest = ca.vertcat(rim, ca.sign(own[2]) * piece[13])
+        point = piece[:3] + turn.T @ furthest
+    return ca.Function(
+        f"support_{shape}", [piece, normal], [ca.densify(point)], ["piece", "normal"], ["point"]
+    )
 
 
 def _support(shape: str, piece: Any, normal: Any) -> Any:

@@ -8,6 +8,7 @@ the process, and is never used.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from itertools import repeat
 from math import inf, sqrt
 from typing import Any
@@ -16,6 +17,7 @@ import fcl
 import numpy as np
 
 from vgtm_qp.arrays import Array
+from vgtm_qp.geometry.bodies import Bodies, Hull
 from vgtm_qp.geometry.shapes import ObstaclePieces
 
 _UNITS = 1e5
@@ -47,7 +49,7 @@ class _Axis:
 
 
 class FclQueries:
-    """FCL objects of all pieces, and two axes that are moved in place.
+    """FCL objects of all pieces and hulls, and two axes that are moved in place.
 
     Attributes
     ----------
@@ -55,9 +57,10 @@ class FclQueries:
         Queries so far, and those whose answer was not proven.
     """
 
-    def __init__(self, pieces: ObstaclePieces, unit: float = 1.0) -> None:
+    def __init__(self, pieces: ObstaclePieces, bodies: Bodies, unit: float = 1.0) -> None:
         self.asked = self.refused = 0
         self._pieces, self._scale = pieces, _UNITS / unit
+        self._hulls = [None if hull is None else _hull(hull, self._scale) for hull in bodies.hulls]
         self._objects: dict[int, Any] = {}
         self._body, self._other = _Axis(), _Axis()
         self._request = fcl.DistanceRequest(enable_nearest_points=True, enable_signed_distance=False)
@@ -76,22 +79,64 @@ class FclQueries:
         time : float
             s; the pieces are where they are at that time.
         """
-        self.asked += len(pairs)
-        ends, body = self._scale * pairs[:, :12], self._body
-        middles, spans = _axes(ends[:, :3], ends[:, 3:6])
+        ends = self._scale * pairs[:, :12]
+        bodies = map(self._body.placed, *_axes(ends[:, :3], ends[:, 3:6]))
         if pieces is None:
             others = map(self._other.placed, *_axes(ends[:, 6:9], ends[:, 9:]))
         else:
             others = map(self._piece, pieces, repeat(time))
+        return self._ask(bodies, others)
+
+    def answers_of_hulls(
+        self, body: Sequence[int], points: Array, other: Sequence[int], of_other: Array, *, is_self: bool
+    ) -> Array:
+        """Return (K, 7) FCL's distance and nearest points, m, of pairs of which at least one body is a hull.
+
+        Parameters
+        ----------
+        body, points : (K,) int, (K, 4, 3)
+            Bodies, and the points that span them, m.
+        other, of_other : (K,) int, (K, 4, 3) or (K, 15)
+            Other bodies and their points, or pieces and their numbers.
+        """
+        bodies = map(self._placed, repeat(self._body), body, points)
+        if is_self:
+            return self._ask(bodies, map(self._placed, repeat(self._other), other, of_other))
+        return self._ask(bodies, map(self._moved, other, of_other))
+
+    def _ask(self, bodies: Iterable[fcl.CollisionObject], others: Iterable[fcl.CollisionObject]) -> Array:
+        """Return FCL's answers (K, 7) for pairs of objects, each placed just before it is asked of."""
         found, request, result, ask = list[float](), self._request, self._result, fcl.distance
-        for middle, span, other in zip(middles, spans, others, strict=True):
+        for body, other in zip(bodies, others, strict=True):
             # A value that FCL does not overwrite must not pass for an answer.
             result.min_distance = inf
-            found.append(ask(body.placed(middle, span), other, request, result))
+            found.append(ask(body, other, request, result))
             here, there = result.nearest_points
             found += here.tolist()
             found += there.tolist()
-        return np.array(found).reshape(len(pairs), 7) / self._scale
+        self.asked += len(found) // 7
+        return np.array(found).reshape(-1, 7) / self._scale
+
+    def _placed(self, axis: _Axis, body: int, points: Array) -> fcl.CollisionObject:
+        """Return the object of a body at its `points` (4, 3), m: its hull, or `axis` for a capsule."""
+        hull = self._hulls[body]
+        if hull is None:
+            first, second = self._scale * points[:2]
+            return axis.placed(0.5 * (first + second), (second - first).tolist())
+        known, corners, inverse = hull
+        # Between two states points go straight, so that their frame is a rotation only nearly.
+        u, _, v = np.linalg.svd((points[1:] - points[0]).T @ inverse)
+        turn = u @ v
+        known.setTransform(fcl.Transform(turn, self._scale * (points.mean(axis=0) - turn @ corners)))
+        return known
+
+    def _moved(self, piece: int, row: Array) -> fcl.CollisionObject:
+        """Return the object of a piece at the place that its numbers `row` (15,) have."""
+        known = self._piece(piece, 0.0)
+        if self._pieces.moving:
+            own = self._pieces.parameters[piece] if self._pieces.shape[piece] == "triangle" else np.zeros(3)
+            known.setTranslation(self._scale * (row[:3] - own[:3]))
+        return known
 
     def _piece(self, piece: int, time: float) -> fcl.CollisionObject:
         """Return the object of a piece at its place at `time`, s."""
@@ -105,6 +150,15 @@ class FclQueries:
                 at += self._pieces.center[piece]
             known.setTranslation(self._scale * at)
         return known
+
+
+def _hull(hull: Hull, scale: float) -> tuple[fcl.CollisionObject, Array, Array]:
+    """Return a hull in FCL's units, the mean (3,) of the corners of its simplex, m, and the inverse of its edges."""
+    faces = np.insert(hull.faces, 0, 3, axis=1).ravel()
+    shape = fcl.Convex(scale * hull.vertices, len(hull.faces), faces)
+    corners = hull.simplex
+    edges = np.linalg.inv((corners[1:] - corners[0]).T)
+    return fcl.CollisionObject(shape, fcl.Transform()), corners.mean(axis=0), edges
 
 
 def _axes(first: Array, second: Array) -> tuple[list[Array], list[list[float]]]:

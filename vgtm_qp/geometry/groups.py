@@ -26,7 +26,7 @@ from vgtm_qp.geometry.pairs import Contacts, PairNames, Wanted
 from vgtm_qp.geometry.shapes import Obstacle, ObstaclePieces
 
 Found = tuple[Index, Array]
-"""The ``Group.numbers`` (R, 8) of pairs, and their contacts (R, ``CONTACT``)."""
+"""The ``Group.numbers`` (R, 2 E + 4) of pairs, and their contacts (R, 2 E + 5), see :class:`Scene`."""
 
 Lowered = Mapping[tuple[int, int, bool], float]
 """Floors of some pairs, m: by body, obstacle or other body, and whether it is a body."""
@@ -49,10 +49,12 @@ class Scene:
         Unit of length of the tolerances of FCL's answers, m.
     fcl : FclQueries or None
         Supplies contacts; None if only closed forms are used.
-    nothing : Contacts
-        No rows.
+    nothing, nothing_found : Contacts, (0, 2 E + 5)
+        No rows, and no contacts.
     shapes : list of str
         Shapes of the others in the pairs; ``"segment"`` is a body.
+    span : int
+        Number E of points that span a body: contacts have 2 E weights in the place of the four of ``exact``.
     """
 
     def __init__(
@@ -70,12 +72,14 @@ class Scene:
         are other `bodies` now.
         """
         self.bodies = self.bodies if bodies is None else bodies
+        self.span = self.bodies.points.shape[1]
         self.obstacles = tuple(obstacles)
         self.pieces = ObstaclePieces(self.obstacles)
         names = tuple(obstacle.name for obstacle in self.obstacles)
         self.names = PairNames(self.bodies, names, tuple(self.pieces.obstacle.tolist()))
-        self.fcl = FclQueries(self.pieces, self.unit) if self._by_fcl else None
-        self.nothing = self._contacts(np.zeros((0, 8), dtype=np.int64), np.zeros((0, CONTACT)))
+        self.fcl = FclQueries(self.pieces, self.bodies, self.unit) if self._by_fcl else None
+        self.nothing_found = np.zeros((0, 2 * self.span + 5))
+        self.nothing = self._contacts(np.zeros((0, 2 * self.span + 4), dtype=np.int64), self.nothing_found)
         self.shapes = sorted({*self.pieces.shape.tolist()} | ({"segment"} if self.has_self else set()))
         for make in (distance_function, sweep_function, *((proof_function,) if self.fcl else ())):
             for shape in self.shapes:
@@ -90,7 +94,7 @@ class Scene:
         return self._contacts(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
     def _contacts(self, numbers: Index, found: Array) -> Contacts:
-        normal, other, is_self = found[:, NORMAL], numbers[:, 5], numbers[:, 6] > 0
+        normal, other, is_self = found[:, NORMAL], numbers[:, -3], numbers[:, -2] > 0
         speed = np.zeros(len(found))
         if self.pieces.moving:
             piece = ~is_self
@@ -98,15 +102,24 @@ class Scene:
         return Contacts(
             distance=found[:, 0],
             normal=normal,
-            points=numbers[:, :4],
-            weights=found[:, 1:5],
+            points=numbers[:, :-4],
+            weights=found[:, 1:-4],
             is_self=is_self,
             normal_speed=speed,
-            body=numbers[:, 4],
+            body=numbers[:, -4],
             other=other,
-            by_fcl=numbers[:, 7] > 0,
+            by_fcl=numbers[:, -1] > 0,
             names=self.names,
         )
+
+    def widened(self, found: Array) -> Array:
+        """Return contacts (..., ``CONTACT``) of capsules with 2 E weights (..., 2 E + 5)."""
+        if 2 * self.span + 5 == CONTACT:
+            return found
+        wide = np.zeros((*found.shape[:-1], 2 * self.span + 5))
+        wide[..., :3], wide[..., NORMAL.start :] = found[..., :3], found[..., NORMAL.start :]
+        wide[..., 1 + self.span : 3 + self.span] = found[..., 3:5]
+        return wide
 
     def batch(self, make: Callable[[str], ca.Function], shape: str) -> Batch:
         """Return a function of :mod:`vgtm_qp.geometry.exact` for many pairs of a shape, made when first needed."""
@@ -144,9 +157,9 @@ class Group:
     ----------
     body, other : (C,) int
         `other` is a piece or, for ``"segment"``, a body.
-    points : (C, 4) int
+    points : (C, 2 E) int
         The points that span `body`, then those of `other`, or the same again for a piece.
-    numbers : (C, 8) int
+    numbers : (C, 2 E + 4) int
         `points`, `body`, `other`, `is_self`, and 0; the last is 1 for a contact that FCL supplied.
     radius : (C,)
         Of the body less the obstacle's allowance, or the sum of both radii, m.
@@ -156,13 +169,21 @@ class Group:
         True for pairs of bodies; True for pairs with obstacles if an obstacle moves.
     place : int
         Index of their list in :class:`vgtm_qp.geometry.candidates.Candidates`.
+    own : int
+        How many of the numbers that :meth:`at` gives for a pair are the points of its body.
+    at_once : int
+        Number of intervals of a motion up to which one more costs nothing.
     """
+
+    own = 6
+    at_once = 16
 
     def __init__(self, scene: Scene, shape: str, body: Index, other: Index, *, place: int = 0) -> None:
         self.scene, self.shape, self.place = scene, shape, place
         self.is_self = shape == "segment"
         self.moving = scene.pieces.moving and not self.is_self
         self._distances = scene.batch(distance_function, shape)
+        self._ends = [0, 1, scene.span, scene.span + 1]
         self._set(body, other, np.zeros(len(body)))
 
     def _set(self, body: Index, other: Index, distance: Array) -> None:
@@ -172,11 +193,12 @@ class Group:
             self.radius = self.radius + bodies.radius[other]
         else:
             self.radius = self.radius - self.scene.pieces.allowance[other]
-        self.numbers = np.zeros((len(body), 8), dtype=np.int64)
-        self.points, self.body, self.other = self.numbers[:, :4], self.numbers[:, 4], self.numbers[:, 5]
-        self.points[:, :2] = bodies.points[body]
-        self.points[:, 2:] = bodies.points[other] if self.is_self else self.points[:, :2]
-        self.body[:], self.other[:], self.numbers[:, 6] = body, other, self.is_self
+        span = bodies.points.shape[1]
+        self.numbers = np.zeros((len(body), 2 * span + 4), dtype=np.int64)
+        self.points, self.body, self.other = self.numbers[:, :-4], self.numbers[:, -4], self.numbers[:, -3]
+        self.points[:, :span] = bodies.points[body]
+        self.points[:, span:] = bodies.points[other] if self.is_self else self.points[:, :span]
+        self.body[:], self.other[:], self.numbers[:, -2] = body, other, self.is_self
 
     def __len__(self) -> int:
         return len(self.body)
@@ -204,7 +226,7 @@ class Group:
         if count and self.is_self:
             bound = bound - self._nearer(displacement, count)
         elif count:
-            bound = bound - displacement.moved.take(self.points[:count, :2]).max(axis=1)
+            bound = bound - displacement.moved.take(self.points[:count, : self.scene.span]).max(axis=1)
             if self.moving:
                 bound -= self.scene.pieces.speed[self.other[:count]] * displacement.elapsed
         return bound, float(self.distance[count] - displacement.greatest) if count < len(self) else np.inf
@@ -217,7 +239,10 @@ class Group:
         """
         points = self.points[:count]
         reference = displacement.reference.take(points, axis=0)
-        vectors = (_RELATIVE @ (state.take(points, axis=0) - reference) for state in displacement.states)
+        shifts = [state.take(points, axis=0) - reference for state in displacement.states]
+        if self.scene.span > 2:
+            return np.asarray(np.max([_apart(shift) for shift in shifts], axis=0))
+        vectors = (_RELATIVE @ shift for shift in shifts)
         return np.asarray(
             np.max([np.sqrt(np.einsum("ksc,ksc->ks", v, v)).sum(axis=1) for v in vectors], axis=0)
         )
@@ -226,14 +251,19 @@ class Group:
         """Return some pairs as the functions of :mod:`vgtm_qp.geometry.exact` take them, (k, 7 + width)."""
         numbers = self.numbers.take(rows, axis=0)
         pairs = np.empty((len(rows), 7 + width(self.shape)))
-        pairs[:, :12], pairs[:, -1] = X.take(numbers[:, :4], axis=0).reshape(-1, 12), self.radius.take(rows)
+        pairs[:, :12] = X.take(numbers[:, self._ends], axis=0).reshape(-1, 12)
+        pairs[:, -1] = self.radius.take(rows)
         if not self.is_self:
-            pairs[:, 6:-1] = self.scene.pieces.at(time).take(numbers[:, 5], axis=0)
+            pairs[:, 6:-1] = self.scene.pieces.at(time).take(numbers[:, -3], axis=0)
         return pairs
 
     def evaluate(self, pairs: Array) -> Array:
-        """Return two contacts (k, 2, ``CONTACT``) for each of `pairs`, as given by :meth:`at`."""
-        return self._distances(pairs).reshape(len(pairs), 2, -1)
+        """Return two contacts (k, 2, 2 E + 5) for each of `pairs`, as given by :meth:`at`."""
+        return self.scene.widened(self._distances(pairs).reshape(len(pairs), 2, CONTACT))
+
+    def sweep(self, start: Array, end: Array) -> Array:
+        """Return ``sweep_function`` (k, 3) of pairs, as given by :meth:`at`, that move from `start` to `end`."""
+        return self.scene.batch(sweep_function, self.shape)(start, end)
 
     def distances(self, X: Array, time: float, rows: Index) -> Array:
         """Return exact surface distances (k,) of some pairs, m."""
@@ -250,7 +280,7 @@ class Group:
         rows, row = np.arange(min(len(self), _FIRST)), -1
         for first in (True, False):
             if len(rows):
-                distance = np.maximum(self.distances(X, time, rows), -self.radius[rows])
+                distance = np.maximum(self.distances(X, time, rows), self._deepest(rows))
                 k = int(np.argmin(distance))
                 if distance[k] < best:
                     best, row = float(distance[k]), int(rows[k])
@@ -259,8 +289,12 @@ class Group:
                 rows = rows[rows >= _FIRST]
         return best, row, len(rows)
 
+    def _deepest(self, rows: Index) -> Array:
+        """Return (R,) bounds that clearances are never below, m."""
+        return np.asarray(-self.radius[rows])
+
     def chosen(self, by: Wanted, rows: Index, found: Array) -> Mask:
-        """Return which of the contacts `found` (R, ``CONTACT``) of the pairs `rows` are wanted."""
+        """Return which of the contacts `found` (R, 2 E + 5) of the pairs `rows` are wanted."""
         return by(self.body[rows], self.other[rows], found[:, 0], is_self=self.is_self)
 
     def floors(self, rows: Index, floor: float, lowered: Lowered) -> Array:
@@ -279,12 +313,12 @@ class Group:
         """Return the nearest of contacts of `rows` with the same body, mesh, normal and place on the body."""
         order = np.argsort(found[:, 0], kind="stable")
         bodies, meshes = self.body[rows], self.scene.pieces.obstacle[self.other[rows]]
-        normal, place = np.round(2.0 * found[:, NORMAL]), np.round(4.0 * found[:, 2])
+        normal, place = np.round(2.0 * found[:, NORMAL]), np.round(4.0 * found[:, 2 : self.scene.span + 1])
         like = np.column_stack([bodies, meshes, normal, place])
         return order[np.sort(np.unique(like[order], axis=0, return_index=True)[1])]
 
     def contacts(self, X: Array, time: float, rows: Index, found: Array, by_fcl: bool) -> Found:
-        """Return the contacts `found` (R, ``CONTACT``) of the pairs `rows`; if `by_fcl`, replaced by FCL's.
+        """Return the contacts `found` (R, 2 E + 5) of the pairs `rows`; if `by_fcl`, replaced by FCL's.
 
         For a pair with two contacts FCL is given the two points of the body. A contact stays as it was found if the
         axes touch or FCL's answer is not proven, see ``proof_function``.
@@ -296,13 +330,21 @@ class Group:
         if len(of_two):
             ends, t = pairs[of_two, :6], found[of_two, 2, None]
             pairs[of_two, :6] = np.tile((1.0 - t) * ends[:, :3] + t * ends[:, 3:], 2)
-        answers = fcl.answers(pairs, None if self.is_self else numbers[:, 5].tolist(), time)
+        answers = fcl.answers(pairs, None if self.is_self else numbers[:, -3].tolist(), time)
         proven = self.scene.batch(proof_function, self.shape)(pairs, answers)
         proven[of_two, 1:3] = found[of_two, 1:3]
         # NaN fails the comparisons.
         unit, gap = self.scene.unit, proven[:, 0] + pairs[:, -1]
         holds = (proven[:, -1] <= PROOF * unit) & (gap > NORMAL_FROM * unit)
         fcl.refused += len(rows) - int(np.count_nonzero(holds))
-        np.copyto(found[:, :-1], proven[:, :-1], where=holds[:, None])
+        np.copyto(found[:, :-1], self.scene.widened(proven)[:, :-1], where=holds[:, None])
         numbers[:, -1] = holds
         return numbers, found
+
+
+def _apart(shift: Array) -> Array:
+    """Return (C,) bounds of how much nearer two bodies came, from displacements (C, 2 E, 3) of their points, m."""
+    both = shift.reshape(len(shift), 2, -1, 3)
+    middle = both.mean(axis=2)
+    turned = np.linalg.norm(both - middle[:, :, None], axis=3).max(axis=2).sum(axis=1)
+    return np.asarray(np.linalg.norm(middle[:, 0] - middle[:, 1], axis=1) + turned)

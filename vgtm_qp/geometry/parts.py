@@ -38,7 +38,8 @@ class Parts:
         self._thickness = np.zeros(len(every))
         np.maximum.at(self._thickness, self._of, bodies.radius)
         # A point is in each part that has one of its bodies, once.
-        points = np.unique(np.repeat(self._of, 2) * len(X) + bodies.points.reshape(-1))
+        span = bodies.points.shape[1]
+        points = np.unique(np.repeat(self._of, span) * len(X) + bodies.points.reshape(-1))
         self._part, self._points = np.divmod(points, len(X))
         self._start = np.searchsorted(self._part, every)
         self._horizon = self.beyond = horizon

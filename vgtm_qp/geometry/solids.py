@@ -6,7 +6,8 @@ import numpy as np
 
 from vgtm_qp.arrays import Array
 from vgtm_qp.geometry.exact import NORMAL
-from vgtm_qp.geometry.groups import Found, Group, Lowered, Scene
+from vgtm_qp.geometry.groups import Found, Lowered, Scene
+from vgtm_qp.geometry.hulls import groups_of
 
 _ROWS = 200_000
 
@@ -31,25 +32,29 @@ class Solids:
         known = besides or {}
         bodies, pieces = self._scene.bodies, self._scene.pieces
         parts: list[Found] = []
+        places = bodies.some(X) if self._meshes else X
         for obstacle, triangles, low, high in self._meshes:
-            points = X - time * self._scene.obstacles[obstacle].velocity
-            inside = ((points >= low) & (points <= high)).all(axis=1)
+            points = places - time * self._scene.obstacles[obstacle].velocity
+            inside = ((points >= low) & (points <= high)).all(axis=-1)
             if inside.any():
                 inside[inside] = winding_number(points[inside], triangles) > 0.5
-            body = np.flatnonzero(inside[bodies.points].any(axis=1))
+            body = np.flatnonzero(inside.any(axis=1))
             body = np.array([b for b in body.tolist() if (b, obstacle, False) not in known], dtype=np.int64)
             if not len(body):
                 continue
             piece = np.flatnonzero(pieces.obstacle == obstacle)
-            group = Group(self._scene, "triangle", np.repeat(body, len(piece)), np.tile(piece, len(body)))
-            found = group.evaluate(group.at(X, time, np.arange(len(group))))[:, 0]
-            nearest = found[:, 0].reshape(len(body), -1).argmin(axis=1) + len(piece) * np.arange(len(body))
-            found, radius = found[nearest], group.radius[nearest]
-            depth = found[:, 0] + radius
-            found[:, 0] = -depth - radius
-            # Turned to lead out, unless the axis touches the surface.
-            found[:, NORMAL] *= np.where(depth > 0.0, -1.0, 1.0)[:, None]
-            parts.append((group.numbers[nearest], found))
+            pairs = np.repeat(body, len(piece)), np.tile(piece, len(body))
+            for group in groups_of(self._scene, "triangle", *pairs):
+                found = group.evaluate(group.at(X, time, np.arange(len(group))))[:, 0]
+                each = found[:, 0].reshape(-1, len(piece)).argmin(axis=1)
+                nearest = each + len(piece) * np.arange(len(each))
+                found, radius = found[nearest], group.radius[nearest]
+                depth = found[:, 0] + radius
+                # The depths of hulls that cut the surface are below zero already.
+                found[:, 0] = -np.abs(depth) - radius
+                # Turned to lead out, unless the body touches the surface.
+                found[:, NORMAL] *= np.where(depth > 0.0, -1.0, 1.0)[:, None]
+                parts.append((group.numbers[nearest], found))
         return parts
 
     def with_enclosed(self, parts: list[Found], X: Array, time: float) -> list[Found]:
@@ -60,11 +65,11 @@ class Solids:
         owner = self._scene.pieces.obstacle
         inside = np.zeros((len(self._scene.bodies), len(self._scene.obstacles)), dtype=bool)
         for numbers, _ in enclosed:
-            inside[numbers[:, 4], owner[numbers[:, 5]]] = True
+            inside[numbers[:, -4], owner[numbers[:, -3]]] = True
         kept = []
         for numbers, found in parts:
-            outside = numbers[:, 6] > 0
-            outside[~outside] = ~inside[numbers[~outside, 4], owner[numbers[~outside, 5]]]
+            outside = numbers[:, -2] > 0
+            outside[~outside] = ~inside[numbers[~outside, -4], owner[numbers[~outside, -3]]]
             kept.append((numbers[outside], found[outside]))
         return kept + enclosed
 

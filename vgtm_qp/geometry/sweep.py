@@ -7,11 +7,9 @@ from typing import NamedTuple
 import numpy as np
 
 from vgtm_qp.arrays import Array, Index
-from vgtm_qp.geometry.exact import CONTACT, sweep_function
 from vgtm_qp.geometry.groups import Group
 
 _DEPTH = 12
-_PIECES = 16
 _SAMPLES = np.linspace(0.0, 1.0, 33)[1:-1]
 
 
@@ -26,7 +24,7 @@ class SweepResult(NamedTuple):
         Rows of the group that were not certified.
     fraction : (F,)
         Place on the motion, 0 < s <= 1, of each such pair's least distance found.
-    contacts : (F, CONTACT)
+    contacts : (F, 2 E + 5)
         Their contacts there.
     """
 
@@ -47,7 +45,8 @@ class _Sweep:
         self._change = group.at(end, start_time, rows) - self._start
         if group.moving:
             velocity = group.scene.pieces.velocity[group.other[rows]]
-            self._change[:, :6] -= np.tile((end_time - start_time) * velocity, 2)
+            shift = (end_time - start_time) * velocity
+            self._change[:, : group.own] -= np.tile(shift, group.own // 3)
 
     def at(self, k: Index, fraction: Array) -> Array:
         """Return the pairs `k` at their `fraction` of the motion."""
@@ -55,8 +54,7 @@ class _Sweep:
 
     def bounds(self, k: Index, left: Array, right: Array) -> Array:
         """Return ``sweep_function`` (len(k), 3) of the pairs `k` between the fractions `left` and `right`."""
-        sweep = self.group.scene.batch(sweep_function, self.group.shape)
-        return sweep(self.at(k, left), self.at(k, right))
+        return self.group.sweep(self.at(k, left), self.at(k, right))
 
     def nearest(self, chosen: Index, worst: Array, fraction: Array) -> Array:
         """Return where the `chosen` pairs are nearest: at the known place, or at one of even samples."""
@@ -81,13 +79,14 @@ def sweep_group(
     count = len(rows)
     floor = np.broadcast_to(floor, count)
     # The motion of few pairs is cut at once, as finely as a call allows at no extra cost.
-    pieces = max(_PIECES // count, 1)
+    pieces = max(group.at_once // count, 1)
     k = np.repeat(np.arange(count), pieces)
     cuts = np.arange(pieces + 1) / pieces
     left, right = np.tile(cuts[:-1], count), np.tile(cuts[1:], count)
     bounds = sweep.bounds(k, left, right)
+    nothing = group.scene.nothing_found
     if (bounds[:, 0] >= floor[k]).all():
-        return SweepResult(float(bounds[:, 0].min()), rows[:0], left[:0], np.zeros((0, CONTACT)))
+        return SweepResult(float(bounds[:, 0].min()), rows[:0], left[:0], nothing)
     failed = np.zeros(count, dtype=bool)
     worst, proven = np.full(count, np.inf), np.full(count, np.inf)
     fraction = np.full(count, 0.5)
@@ -113,7 +112,7 @@ def sweep_group(
     chosen = np.flatnonzero(failed)
     lowest = float(np.where(failed, worst, proven).min())
     if not len(chosen):
-        return SweepResult(lowest, rows[:0], left[:0], np.zeros((0, CONTACT)))
+        return SweepResult(lowest, rows[:0], left[:0], nothing)
     fraction = sweep.nearest(chosen, worst[chosen], fraction[chosen])
     contacts = group.evaluate(sweep.at(chosen, fraction))[:, 0]
     return SweepResult(lowest, rows[chosen], fraction, contacts)

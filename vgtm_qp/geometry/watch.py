@@ -47,9 +47,9 @@ class _FollowCode(IntEnum):
 
 
 def can_be_watched(scene: Scene) -> bool:
-    """Return whether only the arm moves, there are no meshes, and there are not too many pairs."""
+    """Return whether only the arm moves, there are no meshes and no hulls, and there are not too many pairs."""
     bodies, pieces = len(scene.bodies), scene.pieces
-    simple = not pieces.moving and "triangle" not in pieces.shape
+    simple = not (pieces.moving or scene.bodies.hulls) and "triangle" not in pieces.shape
     count = bodies * len(pieces) + (bodies * (bodies - 1) // 2 if scene.has_self else 0)
     return simple and bodies > 1 and 0 < count <= _MOST_PAIRS
 

@@ -10,12 +10,12 @@ from pydantic import Field, ValidationError, ValidationInfo, model_validator
 from pydantic_core import InitErrorDetails
 
 from vgtm_qp.errors import Mistake, ProblemError
+from vgtm_qp.problem.enclosing import spans_volume
 from vgtm_qp.problem.fields import (
     ORIGIN,
     Direction,
     Distance,
     File,
-    Length,
     Limit,
     Name,
     Number,
@@ -32,6 +32,9 @@ from vgtm_qp.problem.urdf import UrdfJoint, read_urdf
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
+
+MOST_POINTS = 5000
+"""Greatest number of points of a body."""
 
 OF_URDF = ("urdf", "package_path", "base_link", "tip_link", "home", "bodies")
 """Keys that say which arm is read from a URDF file, and how it is read."""
@@ -99,16 +102,24 @@ class JointLock(LockTable, called="a locked joint"):
 
 
 class ArmBody(Table, called="a body"):
-    """A capsule or ball that moves with a joint and is kept clear of obstacles."""
+    """A ball, capsule or convex hull that moves with a joint and is kept clear of obstacles."""
 
     name: Name = Field(description="name of the body")
     joint: Name | None = Field(
         default=None, description="the joint that it moves with; where absent, it is fixed to the base"
     )
-    points: Annotated[tuple[Vector, ...], Field(min_length=1, max_length=2)] = Field(
-        description="both ends of its axis, or its centre, in the frame of that joint, m"
+    points: Annotated[tuple[Vector, ...], Field(min_length=1, max_length=MOST_POINTS)] = Field(
+        description="a ball's centre, both ends of a capsule's axis, or four points or more, whose hull the body is; "
+        "in the frame of that joint, m"
     )
-    radius: Length = Field(description="m")
+    radius: Distance = Field(default=0.0, description="of a ball or capsule, or thickness round a hull, m")
+
+    def _contradictions(self) -> Iterator[tuple[Place, str]]:
+        count = len(self.points)
+        if count <= 2 and self.radius == 0.0:
+            yield ("radius",), "a number above 0: the radius of a ball or capsule, m"
+        if count == 3 or (count > 3 and not spans_volume(self.points)):
+            yield ("points",), "one point, two, or four and more that are not in one plane"
 
 
 class ArmTable(Table, called="an arm"):
@@ -130,8 +141,10 @@ class ArmTable(Table, called="an arm"):
         default=None,
         description="joint values of the home pose of a URDF, rad or m; 0 within the limits where absent",
     )
-    bodies: Literal["capsule"] = Field(
-        default="capsule", description="what stands for the collision shapes of a URDF: enclosing capsules"
+    bodies: Literal["hull", "capsule", "primitives"] = Field(
+        default="hull",
+        description="what stands for the collision shapes of a URDF: their convex hulls, enclosing capsules, or the "
+        "shapes themselves, which then may not be meshes",
     )
     joint: tuple[Joint, ...] = Field(default=(), description="the joints, base first")
     tip: Vector = Field(default=ORIGIN, description="position of the end effector in the last frame, m")
@@ -236,7 +249,8 @@ def _urdf_keys(data: Mapping[str, Any], context: Mapping[str, Any]) -> dict[str,
         if not (folder / Path(file).expanduser()).is_file():
             return {}
         found = [folder / Path(place).expanduser() for place in places]
-        arm = read_urdf(folder / Path(file).expanduser(), **links, package_path=found)
+        bodies = data.get("bodies", "hull")
+        arm = read_urdf(folder / Path(file).expanduser(), **links, package_path=found, bodies=bodies)
     except ProblemError as error:
         raise _wrong([_of_file(mistake) for mistake in error.mistakes]) from None
     except (TypeError, ValueError, RuntimeError):

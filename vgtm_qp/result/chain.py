@@ -31,9 +31,13 @@ class RecordedChain:
         Followers, and the joints that they follow; and the multipliers.
     base : (1,) int
         The point that the problem places.
-    links, members : (B, 2) int
-        The two points of each link, counted from the base over the joints to the tip, then those of bodies;
-        and the link's ends, one of which it shares with each neighbour.
+    links : (B, V) int
+        The points whose convex hull each link is, but for its radius, counted from the base over the joints to the
+        tip, then those of bodies: the two ends of its axis, or the vertices of a hull. The last one is repeated.
+    is_hull : (B,) bool
+        False for links with an axis.
+    members : (B, 2) int
+        The link's ends, one of which it shares with each neighbour.
     points, carriers : (P, 3), (P,) int
         Points of bodies, m, in the frames of the joints that they move with, and the numbers of those joints.
     touching : (K, 2) int
@@ -77,7 +81,10 @@ class RecordedChain:
         none = np.zeros(0, dtype=np.int64)
         self.carriers = table.integers("carriers", (len(self.points),), joints + 1) if bodies else none
         self.touching = table.integers("touching", (None, 2), links) if bodies else none.reshape(0, 2)
-        self.links = table.integers("links", (links, 2), joints + 2 + len(self.points))
+        self.links = table.integers("links", (links, None), joints + 2 + len(self.points))
+        if self.links.shape[1] < 2:
+            raise ResultError("manifest.arm.links: expected two points or more of each link")
+        self.is_hull = (self.links[:, 1:] != self.links[:, 1:2]).any(axis=1)
         self.members = table.integers("joined", (links, 2), 2 * links + joints + 2)
         self.free, self.base = np.zeros(0, dtype=np.int64), np.zeros(1, dtype=np.int64)
         self.stretches = np.zeros(links, dtype=np.bool_)
@@ -155,14 +162,22 @@ class RecordedChain:
         found, number = [], {name: k + 1 for k, name in enumerate(self.quantity_names)}
         first = len(number) + 2
         for k, body in enumerate(table):
-            ends, radius = np.array(body["points"], dtype=float), float(body["radius"])
+            ends, radius = np.array(body["points"], dtype=float), float(body.get("radius") or 0.0)
             own = self.links[k] - first
             carrier = number.get(str(body.get("joint")), 0)
             if own.min() < 0 or (self.carriers[own] != carrier).any():
                 found.append(f"the arm record's joint of body {body['name']} differs from the problem's")
-            elif not same(self.radius[k], radius) or not _are_ends(self.points[own], ends, radius):
+            elif not same(self.radius[k], radius) or not self._is_shape(k, own, ends, radius):
                 found.append(f"the arm record's shape of body {body['name']} differs from the problem's")
         return found
+
+    def _is_shape(self, link: int, own: Index, points: Array, radius: float) -> bool:
+        """Whether the recorded points `own` (V,) of a link are the `points` (K, 3) of its table, m."""
+        if len(points) <= 2:
+            return not self.is_hull[link] and _are_ends(self.points[own[:2]], points, radius)
+        count = len(points)
+        is_padded = count <= len(own) and bool((own[count:] == own[count - 1]).all())
+        return is_padded and same(self.points[own[:count]], points)
 
     def placed(self, q: Array) -> tuple[Array, Array, Array]:
         """Return points (Q, J + 2 + P, 3), m, axes (Q, J, 3) and last frames (Q, 3, 3) at configurations (Q, J + 6).
@@ -183,18 +198,20 @@ class RecordedChain:
                 at = at + q[:, j, None] * axes[-1]
             frames.append((at, frame))
         points.append(at + frame @ self.tip)
-        for point, carrier in zip(self.points, self.carriers.tolist(), strict=True):
+        own = np.empty((len(q), *self.points.shape))
+        for carrier in np.unique(self.carriers).tolist():
             origin, attitude = frames[carrier]
-            points.append(origin + attitude @ point)
-        return np.stack(points, axis=1), np.stack(axes, axis=1), frame
+            rows = np.flatnonzero(self.carriers == carrier)
+            own[:, rows] = origin[:, None] + self.points[rows] @ np.swapaxes(attitude, 1, 2)
+        return np.concatenate([np.stack(points, axis=1), own], axis=1), np.stack(axes, axis=1), frame
 
     def ends(self, points: Array) -> Array:
-        """Return (..., B, 2, 3) the ends of the links for points (..., J + 2, 3)."""
+        """Return (..., B, V, 3) the ends or vertices of the links for points (..., J + 2 + P, 3)."""
         return np.asarray(points[..., self.links, :])
 
     def lengths(self, points: Array) -> Array:
-        """Return (..., B) the lengths of the links, m, for points (..., J + 2, 3)."""
-        return np.asarray(np.linalg.norm(np.diff(self.ends(points), axis=-2)[..., 0, :], axis=-1))
+        """Return (..., B) the lengths of the links, m, for points (..., J + 2 + P, 3): of hulls, of boxes round them."""
+        return np.asarray(np.linalg.norm(np.ptp(self.ends(points), axis=-2), axis=-1))
 
     def quantities(self, q: Array) -> Array:
         """Return (T, J) the quantities at configurations (T, J + 6), or joint values (T, J): see the class."""
@@ -235,11 +252,11 @@ class RecordedChain:
         return 1.0, *extreme_values(jacobian)
 
     def states_ends(self, q: Array) -> Array:
-        """Return (T, B, 2, 3) the ends of the links, m, at configurations (T, J + 6)."""
+        """Return (T, B, V, 3) the ends or vertices of the links, m, at configurations (T, J + 6)."""
         return self.ends(self.placed(q)[0])
 
     def ends_between(self, before: Array, after: Array, share: Array, link: Index) -> Array:
-        """Return (P, 2, 3) the ends, m, of links (P,) at shares (P,) of a straight motion between states."""
+        """Return (P, V, 3) the ends, m, of links (P,) at shares (P,) of a straight motion between states."""
         # Many pairs of one kind after another are evaluated at the same few instants.
         if self._way is None or self._way[:2] != (before.tobytes(), after.tobytes()):
             self._way = before.tobytes(), after.tobytes(), np.zeros(0), np.zeros((0, *self.links.shape, 3))

@@ -39,6 +39,8 @@ class RecordedArm:
         Names and home lengths of the members, actuated and fixed.
     length, stroke, rate, acceleration, radius : (M,), (M, 2), (M,), (M,), (M,)
         Home lengths and limits; inf without a limit.
+    is_hull : (M,) bool
+        All False.
     corners, offset : (M, 2, 3) int or (M, 2, 1) int, (M, 2, 3)
         Nodes that place the two ends of each member and orient its joints, and the ends in the joint frames,
         eqs. (12)-(13). For pin joints: the end's node alone, and zeros.
@@ -62,6 +64,7 @@ class RecordedArm:
         self.rate = table.numbers("rate", (count,), limits=True)
         self.acceleration = table.numbers("acceleration", (count,), limits=True)
         self.radius = table.numbers("radius", (count,))
+        self.is_hull = np.zeros(count, dtype=np.bool_)
         tip = table.table("tip")
         self.tip = tip.integers("nodes", (None,), nodes)
         self.tip_weights = tip.numbers("weights", (len(self.tip),))

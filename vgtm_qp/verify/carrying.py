@@ -58,6 +58,7 @@ class CarryingArm:
         pairs = np.stack([first, second], axis=-1)[first < second]
         self.touching = np.concatenate([arm.touching, pairs])
         self.size, self.stretches = arm.size, arm.stretches
+        self.is_hull = np.concatenate([arm.is_hull, np.zeros(len(new), dtype=np.bool_)])
         self._way = (b"", b"")
         self._known: dict[float, Array] = {}
         """Ends at the shares of the last motion of :meth:`ends_between` that were evaluated so far."""
@@ -76,15 +77,18 @@ class CarryingArm:
         return wrong, notes
 
     def states_ends(self, states: Array) -> Array:
-        """Return (T, M, 2, 3) the ends of all bodies, m, at states (T, ...)."""
-        return np.concatenate([self._arm.states_ends(states), self._placed(states)], axis=1)
+        """Return (T, M, V, 3) the ends of all bodies, m, at states (T, ...)."""
+        own, carried = self._arm.states_ends(states), self._placed(states)
+        return np.concatenate([own, carried[:, :, np.arange(own.shape[2]) % 2]], axis=1)
 
     def ends_between(self, before: Array, after: Array, share: Array, body: Index) -> Array:
-        """Return (P, 2, 3) the ends, m, of bodies (P,) at shares (P,) of a straight motion between states."""
-        found, own = np.empty((len(body), 2, 3)), body < self._count
-        found[own] = self._arm.ends_between(before, after, share[own], body[own])
+        """Return (P, V, 3) the ends, m, of bodies (P,) at shares (P,) of a straight motion between states."""
+        own = body < self._count
+        ends_of_own = self._arm.ends_between(before, after, share[own], body[own])
         if own.all():
-            return found
+            return ends_of_own
+        found = np.empty((len(body), *ends_of_own.shape[1:]))
+        found[own] = ends_of_own
         if self._way != (way := (before.tobytes(), after.tobytes())):
             self._way, self._known = way, {}
         at, which = np.unique(share[~own], return_inverse=True)
@@ -94,7 +98,7 @@ class CarryingArm:
             placed = self._placed((1.0 - shares) * before + shares * after)
             self._known |= dict(zip(fresh, placed, strict=True))
         ends = np.stack([self._known[one] for one in at.tolist()])
-        found[~own] = ends[which, body[~own] - self._count]
+        found[~own] = ends[which, body[~own] - self._count][:, np.arange(found.shape[1]) % 2]
         return found
 
     def bend(self, before: Array, after: Array, body: Index) -> Array:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.verify.arm import Arm
 from vgtm_qp.verify.carrying import CarryingArm
+from vgtm_qp.verify.convex import hull_distance
 from vgtm_qp.verify.distance import Separation, segment_segment
 from vgtm_qp.verify.obstacles import Body
 
@@ -39,7 +40,7 @@ _CHUNK = 200_000
 class RecordedMotion:
     """The moving arm: times (T,), s, and states, which are nodes (T, N, 3), m, or joints and base (T, J + 6).
 
-    The ends (T, M, 2, 3), m, are those of its bodies at the states. In names the states count from `first` on.
+    The ends (T, M, V, 3), m, are those of its bodies at the states, or their vertices. In names the states count from `first` on.
     """
 
     def __init__(self, arm: Arm | CarryingArm, time: Array, states: Array, first: int = 0) -> None:
@@ -61,7 +62,7 @@ class RecordedMotion:
         return f"state {self.first + state}"
 
     def ends_between(self, step: int, body: Index, share: Array) -> Array:
-        """Return (P, 2, 3) the ends, m, of bodies (P,) at shares (P,) of the motion from state `step` to the next."""
+        """Return (P, V, 3) the ends, m, of bodies (P,) at shares (P,) of the motion from state `step` to the next."""
         return self.arm.ends_between(self.states[step], self.states[step + 1], share, body)
 
     def bend(self, step: int, body: Index) -> Array:
@@ -103,9 +104,9 @@ class Encounters(ABC):
 
     @abstractmethod
     def points(self, pair: Pairs, ends: Callable[[Index], Array], time: Array) -> Array:
-        """Return (P, 2 or 4, 3) the points that the pairs' separation depends on, m.
+        """Return (P, V or 2 V, 3) the points that the pairs' separation depends on, m.
 
-        `ends` gives (P, 2, 3) the ends of members (P,) at the times (P,), s.
+        `ends` gives (P, V, 3) the ends of members (P,) at the times (P,), s.
         """
 
     @abstractmethod
@@ -128,9 +129,17 @@ class Encounters(ABC):
         """Return the name of the pair."""
 
     def deepest(self, pair: Pairs) -> Array:
-        """Return (P,) the distances of pairs whose axes touch, m: none is less."""
+        """Return (P,) the distances of pairs whose axes touch, m: none is less, but for hulls."""
         count = len(pair[0])
-        return self.apart(np.zeros((count, 4, 3)), np.zeros((count, 3)), pair)
+        return self.apart(np.zeros((count, 2 * self.motion.ends.shape[2], 3)), np.zeros((count, 3)), pair)
+
+    def _floor(self, pair: Pairs) -> Array:
+        """Return (P,) what no distance is below, m."""
+        return np.where(self.with_hull(pair), -np.inf, self.deepest(pair))
+
+    @abstractmethod
+    def with_hull(self, pair: Pairs) -> NDArray[np.bool_]:
+        """Return (P,) which of the pairs have a hull."""
 
     def distances(self, state: int, pair: Pairs) -> Array:
         """Return the exact distances (P,) of pairs at a state, m."""
@@ -196,8 +205,7 @@ class Encounters(ABC):
                 distance, normal = self.separation(points, pair)
                 limit = limit.or_lower(distance, self._called_between(step, share, pair))
                 held = np.minimum(*(self.apart(ends, normal, pair) for ends in edges))
-                touching = self.apart(points, np.zeros_like(normal), pair)
-                proven = np.maximum(proven, np.maximum(held - bend * width**2 / 8.0, touching))
+                proven = np.maximum(proven, np.maximum(held - bend * width**2 / 8.0, self._floor(pair)))
             open_ = (proven < limit.value - self.motion.resolution) & np.isfinite(bend)
             if depth == _GREATEST_DEPTH - 1 or open_.sum() > _GREATEST_COUNT:
                 open_[:] = False
@@ -255,7 +263,7 @@ class AgainstBody(Encounters):
     def at_state(self, state: int) -> Least:
         """Return the exact least clearance at a state; a member inside a closed mesh counts as touching."""
         ends = self.motion.ends[state] - self._centers[state]
-        inside = self.body.encloses(ends.reshape(-1, 3)).reshape(-1, 2).any(axis=1)
+        inside = self.body.encloses(ends.reshape(-1, 3)).reshape(len(ends), -1).any(axis=1)
         depth = np.where(inside, -self.motion.arm.radius, np.inf)
         return (
             super()
@@ -264,18 +272,25 @@ class AgainstBody(Encounters):
         )
 
     def points(self, pair: Pairs, ends: Callable[[Index], Array], time: Array) -> Array:
-        """Return (P, 2, 3) the ends of the members, seen from the centre of the body."""
+        """Return (P, V, 3) the ends of the members, seen from the centre of the body."""
         return np.asarray(ends(pair[0]) - self.body.at(time)[:, None])
 
     def separation(self, points: Array, pair: Pairs) -> Separation:
         """Return surface distances and normals."""
         distance, normal = self.body.separation(points[:, 0], points[:, 1], pair[1])
+        hull = self.with_hull(pair)
+        if hull.any():
+            distance[hull], normal[hull] = self.body.hull_separation(points[hull], pair[1][hull])
         return distance - self.motion.arm.radius[pair[0]], normal
 
     def apart(self, points: Array, normal: Array, pair: Pairs) -> Array:
         """Return the gaps between members and pieces."""
         nearest = np.einsum("pec,pc->pe", points, normal).min(axis=1)
         return np.asarray(nearest - self.body.support(normal, pair[1]) - self.motion.arm.radius[pair[0]])
+
+    def with_hull(self, pair: Pairs) -> NDArray[np.bool_]:
+        """See ``Encounters``."""
+        return np.asarray(self.motion.arm.is_hull[pair[0]])
 
     def _bend(self, step: int, pair: Pairs) -> Array:
         return self.motion.bend(step, pair[0])
@@ -329,18 +344,22 @@ class AgainstMembers(Encounters):
         return a[gap < limit], b[gap < limit]
 
     def points(self, pair: Pairs, ends: Callable[[Index], Array], time: Array) -> Array:  # noqa: ARG002
-        """Return (P, 4, 3) the ends of both members."""
+        """Return (P, 2 V, 3) the ends of both members."""
         return np.concatenate([ends(member) for member in pair], axis=1)
 
     def separation(self, points: Array, pair: Pairs) -> Separation:
         """Return surface distances and normals."""
-        distance, normal = segment_segment(*(points[:, k] for k in range(4)))
+        distance, normal = body_distance(points, self.with_hull(pair))
         return distance - self.radii(pair), normal
 
     def apart(self, points: Array, normal: Array, pair: Pairs) -> Array:
         """Return the gaps between both members."""
-        along = np.einsum("pec,pc->pe", points, normal)
-        return np.asarray(along[:, :2].min(axis=1) - along[:, 2:].max(axis=1) - self.radii(pair))
+        along, count = np.einsum("pec,pc->pe", points, normal), points.shape[1] // 2
+        return np.asarray(along[:, :count].min(axis=1) - along[:, count:].max(axis=1) - self.radii(pair))
+
+    def with_hull(self, pair: Pairs) -> NDArray[np.bool_]:
+        """See ``Encounters``."""
+        return np.asarray(self.motion.arm.is_hull[np.stack(pair)].any(axis=0))
 
     def _bend(self, step: int, pair: Pairs) -> Array:
         return self.motion.bend(step, pair[0]) + self.motion.bend(step, pair[1])
@@ -358,10 +377,29 @@ def apart_at_home(arm: Arm, resolution: float) -> list[str]:
     """Return the pairs of bodies recorded as touching at home that are further apart there than the `resolution`, m."""
     first, second = arm.touching.T
     ends = arm.ends(arm.home)
-    gap, _ = segment_segment(ends[first, 0], ends[first, 1], ends[second, 0], ends[second, 1])
+    with_hull = arm.is_hull[first] | arm.is_hull[second]
+    gap, _ = body_distance(np.concatenate([ends[first], ends[second]], axis=1), with_hull)
     apart = gap - arm.radius[first] - arm.radius[second] > resolution
     names = arm.member_names
     return [f"{names[a]} / {names[b]} do not touch at home" for a, b in arm.touching[apart].tolist()]
+
+
+def body_distance(points: Array, hull: NDArray[np.bool_]) -> Separation:
+    """Return distances (P,), m, and normals (P, 3) between two bodies of the arm each, without their radii.
+
+    `points` (P, 2 V, 3) are the ends or vertices of both; `hull` (P,) says where at least one of them is a hull.
+    """
+    count = points.shape[1] // 2
+    distance, normal = segment_segment(*(points[:, k] for k in (0, 1, count, count + 1)))
+    if hull.any():
+        others = points[hull, count:]
+
+        def furthest(direction: Array, rows: Index) -> Array:
+            corner = np.einsum("pvc,pc->pv", others[rows], direction).argmax(axis=1)
+            return np.asarray(others[rows, corner])
+
+        distance[hull], normal[hull] = hull_distance(points[hull, :count], furthest)
+    return distance, normal
 
 
 def box_gap(low: Array, high: Array, other_low: Array, other_high: Array) -> Array:

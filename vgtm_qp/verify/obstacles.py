@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.result.poses import rotation_matrix
+from vgtm_qp.verify.convex import hull_distance
 from vgtm_qp.verify.distance import Separation, segment_ball, segment_box, segment_cylinder, segment_triangle
 
 _GREATEST = 1e6
@@ -30,10 +31,14 @@ class Shape:
     """(K, ...) the sizes of each piece, m, for the functions below."""
     distance: Callable[[Array, Array, Array], Separation]
     """Distances and normals of P segments, from start to end (P, 3), against pieces of sizes (P, ...)."""
-    reach: Callable[[Array, Array], Array]
-    """Greatest ``normal . x`` (P,) over the points x of pieces of sizes (P, ...) for normals (P, 3), m."""
+    furthest: Callable[[Array, Array], Array]
+    """The points (P, 3) of pieces of sizes (P, ...) that are furthest along normals (P, 3), m."""
     closed: bool | None = None
     """Whether the pieces are a closed surface, with an inside; None if they are solid themselves."""
+
+    def reach(self, normal: Array, sizes: Array) -> Array:
+        """Return the greatest ``normal . x`` (P,) over the points x of pieces of `sizes` for normals (P, 3), m."""
+        return np.asarray(np.einsum("pc,pc->p", normal, self.furthest(normal, sizes)))
 
 
 _BOX_CORNERS: Array = np.array([list(itertools.product((-1.0, 1.0), repeat=3))])
@@ -41,44 +46,50 @@ _BOX_CORNERS: Array = np.array([list(itertools.product((-1.0, 1.0), repeat=3))])
 
 def box(half: Array) -> Shape:
     """Return a solid box of half edges `half` (3,), m."""
-    return Shape(_BOX_CORNERS * half, np.array([half], dtype=float), segment_box, _box_reach)
+    return Shape(_BOX_CORNERS * half, np.array([half], dtype=float), segment_box, _box_furthest)
 
 
 def ball(radius: float) -> Shape:
     """Return a solid sphere of radius `radius`, m."""
-    return Shape(_BOX_CORNERS * radius, np.array([radius]), segment_ball, _ball_reach)
+    return Shape(_BOX_CORNERS * radius, np.array([radius]), segment_ball, _ball_furthest)
 
 
 def cylinder(radius: float, half_height: float) -> Shape:
     """Return a solid cylinder round the z axis, of radius `radius` and height 2 `half_height`, m."""
     corners = _BOX_CORNERS * np.array([radius, radius, half_height])
-    return Shape(corners, np.array([[radius, half_height]]), _cylinder_distance, _cylinder_reach)
+    return Shape(corners, np.array([[radius, half_height]]), _cylinder_distance, _cylinder_furthest)
 
 
 def mesh(triangles: Array, closed: bool) -> Shape:
     """Return a surface of `triangles` (F, 3, 3), m; that of a solid if `closed`."""
-    return Shape(triangles, triangles, segment_triangle, _triangle_reach, closed)
+    return Shape(triangles, triangles, segment_triangle, _triangle_furthest, closed)
 
 
-def _box_reach(normal: Array, half: Array) -> Array:
-    return np.asarray(np.einsum("pc,pc->p", np.abs(normal), half))
+def _box_furthest(normal: Array, half: Array) -> Array:
+    return np.sign(normal) * half
 
 
-def _ball_reach(normal: Array, radius: Array) -> Array:
-    return np.asarray(radius * np.linalg.norm(normal, axis=1))
+def _ball_furthest(normal: Array, radius: Array) -> Array:
+    return radius[:, None] * _unit(normal)
+
+
+def _unit(vectors: Array) -> Array:
+    """Return vectors (P, C) over their lengths; zero ones stay."""
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1), 1e-300)[:, None])
 
 
 def _cylinder_distance(start: Array, end: Array, sizes: Array) -> Separation:
     return segment_cylinder(start, end, sizes[:, 0], sizes[:, 1])
 
 
-def _cylinder_reach(normal: Array, sizes: Array) -> Array:
-    radial = np.linalg.norm(normal[:, :2], axis=1)
-    return np.asarray(sizes[:, 0] * radial + sizes[:, 1] * np.abs(normal[:, 2]))
+def _cylinder_furthest(normal: Array, sizes: Array) -> Array:
+    rim = sizes[:, :1] * _unit(normal[:, :2])
+    return np.concatenate([rim, sizes[:, 1:] * np.sign(normal[:, 2:])], axis=1)
 
 
-def _triangle_reach(normal: Array, triangles: Array) -> Array:
-    return np.asarray(np.einsum("pkc,pc->pk", triangles, normal).max(axis=1))
+def _triangle_furthest(normal: Array, triangles: Array) -> Array:
+    corner = np.einsum("pkc,pc->pk", triangles, normal).argmax(axis=1)
+    return np.asarray(triangles[np.arange(len(triangles)), corner])
 
 
 @dataclass(frozen=True)
@@ -106,6 +117,14 @@ class Body:
         """Return distances and normals of P segments against the pieces (P,) of this body."""
         start, end = start @ self.rotation, end @ self.rotation
         distance, normal = self.shape.distance(start, end, self.shape.sizes[piece])
+        return distance, normal @ self.rotation.T
+
+    def hull_separation(self, vertices: Array, piece: Index) -> Separation:
+        """Return distances and normals of P convex hulls of `vertices` (P, V, 3) against the pieces (P,)."""
+        sizes, shape = self.shape.sizes[piece], self.shape
+        distance, normal = hull_distance(
+            vertices @ self.rotation, lambda normal, rows: shape.furthest(normal, sizes[rows])
+        )
         return distance, normal @ self.rotation.T
 
     def support(self, normal: Array, piece: Index) -> Array:

@@ -35,11 +35,13 @@ def excuse_recovering(
                 continue
             found += 1
             index = (np.array([pair[0] for pair in pairs]), np.array([pair[1] for pair in pairs]))
+            # However deep an axis or a hull is inside, its distance here is minus the radius.
+            deepest = float(group.deepest(index).min())
             distance = np.array([group.distances(k, index).min() for k in range(len(group.motion.time))])
+            distance = np.maximum(distance, deepest)
             kept = np.flatnonzero(distance >= floor - CLEARANCE_TOLERANCE)
             since = int(kept[0]) if len(kept) else len(distance)
-            # However deep an axis is inside, its distance here is minus the radius.
-            off = distance[0] - max(wanted[name], float(group.deepest(index).min()))
+            off = distance[0] - max(wanted[name], deepest)
             if since == 0 or abs(off) > CLEARANCE_TOLERANCE:
                 wrong.append(
                     f"recovered: {name} is {distance[0]:.9g} m apart {_at_first(group)}, not {wanted[name]:.9g} m"
@@ -80,7 +82,7 @@ def _nearer(group: Encounters, pairs: Pairs, name: str, distance: Array, floor: 
                 f"recovered: {name} is {distance[state + 1]:.9g} m apart at {where} after {least:.9g} m"
             )
         limit, bound = group.divide(state, pairs, Least(), Least())
-        least_between = min(limit.value, bound.value)
+        least_between = max(min(limit.value, bound.value), float(group.deepest(pairs).min()))
         if least_between < least - BETWEEN_TOLERANCE * group.motion.arm.size:
             step = group.motion.first + state + 1
             wrong.append(

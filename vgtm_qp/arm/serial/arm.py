@@ -12,11 +12,11 @@ import numpy as np
 from vgtm_qp.arm.arm import Approach, Stations, Tip, has_full_rank
 from vgtm_qp.arm.frames import frames_along
 from vgtm_qp.arm.joint_space import Follower, JointSpaceArm
-from vgtm_qp.arm.serial.chain import SerialChain
+from vgtm_qp.arm.serial.chain import SerialChain, hull_of, vertices_of
 from vgtm_qp.arrays import Array, Index, Mask
-from vgtm_qp.geometry.bodies import Bodies, capsules
+from vgtm_qp.geometry.bodies import Bodies, Hull, capsules, convex_bodies
 from vgtm_qp.geometry.clearance import Clearance
-from vgtm_qp.problem.arm import ArmTable, Joint
+from vgtm_qp.problem.arm import ArmBody, ArmTable, Joint
 
 _BENDS = (0.1, 0.3, -0.3)
 """Turns, rad, that are tried to bend a home from which the tip cannot start in every direction."""
@@ -43,13 +43,19 @@ class SerialArm(JointSpaceArm):
         self.actuated = np.array([joint.name not in stuck and joint.mimic is None for joint in joints])
         self._limit(joints)
         self.home_quantities = self.measured(self.home_configuration)
-        chain = SerialChain.of(spec)
+        hulls = [hull_of(body) for body in spec.body or ()]
+        chain = SerialChain.of(spec, hulls)
         self.chain = chain if spec.every else replace(chain, every=self._every(chain))
         self.functions, self.constants = self.chain.functions, self.chain.constants
         self.revolute, self.reaches = chain.revolute, self._reaches()
         self.actuator_units = tuple("rad" if turns else "m" for turns in self.revolute[self.actuated])
         self._place_stations(spec.tip_rotation_vector)
-        self.bodies = self._links(spec.link_radius) if spec.body is None else self._apart(self._carried(spec))
+        if spec.body is None:
+            self._vertices, self.bodies = None, self._links(spec.link_radius)
+            return
+        sides = zip(spec.body, hulls, strict=True)
+        self._vertices = tuple(vertices_of(body, hull)[1] for body, hull in sides)
+        self.bodies = self._apart(self._carried(spec.body, hulls))
 
     def _limit(self, joints: Sequence[Joint]) -> None:
         """Find followers and limits; the limits of a follower become limits of the joint that it follows."""
@@ -125,7 +131,7 @@ class SerialArm(JointSpaceArm):
         chain, (to_places, to_frames) = self.chain, self._ways
         beside = np.full(len(chain) + 1, np.sqrt(2.0) * chain.spread)
         tip = to_places[-1] + beside[-1]
-        np.maximum.at(beside, chain.carriers, np.linalg.norm(chain.points, axis=1))
+        np.maximum.at(beside, chain.carriers, chain.beyond)
         furthest = to_frames + beside
         furthest[-1] = max(furthest[-1], tip)
         reaches = np.maximum.accumulate(furthest[::-1])[::-1]
@@ -167,7 +173,7 @@ class SerialArm(JointSpaceArm):
     def _extents(self) -> Array:
         """(B,) lengths along the links from the base to the furthest points of bodies, m."""
         chain, (to_places, to_frames) = self.chain, self._ways
-        to_points = to_frames[chain.carriers] + np.linalg.norm(chain.points, axis=1)
+        to_points = to_frames[chain.carriers] + chain.beyond
         extents: Array = np.concatenate([[0.0], to_places, to_points])[self.bodies.points].max(axis=1)
         return extents
 
@@ -213,14 +219,18 @@ class SerialArm(JointSpaceArm):
             place[node] = node if apart[node - 1] else place[node + 1]
         return place
 
-    def _carried(self, spec: ArmTable) -> Bodies:
+    def _carried(self, table: Sequence[ArmBody], hulls: Sequence[Hull | None]) -> Bodies:
         """Return the bodies of the table; those that move with one joint, or with successive ones, are neighbours."""
-        table, place = spec.body or (), self._places()
-        points = len(self.chain) + 2 + np.arange(2 * len(table)).reshape(-1, 2)
-        carrier = self.chain.carriers[::2]
-        joints = place[np.stack([carrier, carrier + 1], axis=1)]
+        spans = [2 if hull is None else len(hull.simplex) for hull in hulls]
+        first = np.cumsum([0, *spans])
+        points = [
+            range(len(self.chain) + 2 + k, len(self.chain) + 2 + k + n)
+            for k, n in zip(first, spans, strict=False)
+        ]
+        carrier = self.chain.carriers[first[:-1]]
+        joints = self._places()[np.stack([carrier, carrier + 1], axis=1)]
         radius, names = [body.radius for body in table], [body.name for body in table]
-        return capsules(points, radius, names, joints=joints, kind="link")
+        return convex_bodies(points, hulls, radius, names, joints=joints)
 
     def _apart(self, bodies: Bodies) -> Bodies:
         """Return the bodies without the pairs that touch at home: these are not kept apart."""
@@ -244,12 +254,16 @@ class SerialArm(JointSpaceArm):
         return ()
 
     def hollow(self) -> float:
-        """See ``arm.Arm``: from the tip to the axes of the bodies that move with it."""
-        last = len(self.chain) + 2 + np.flatnonzero(self.chain.carriers == len(self.chain))
+        """See ``arm.Arm``: from the tip to points of the bodies that move with it."""
         if not len(self.chain.points):
             return 0.0
-        gaps = np.linalg.norm(self.home[last] - self.end_effector.position(self.home), axis=1)
+        points = self.bodies.some(self.home)[self._carriers() == len(self.chain)]
+        gaps = np.linalg.norm(points - self.end_effector.position(self.home), axis=2)
         return float(gaps.min(initial=np.inf))
+
+    def _carriers(self) -> Index:
+        """Return (B,) numbers of the joints that bodies of the table move with."""
+        return np.asarray(self.chain.carriers[self.bodies.points[:, 0] - len(self.chain) - 2])
 
     def record(self) -> dict[str, Any]:
         """See ``arm.Arm``.
@@ -257,19 +271,19 @@ class SerialArm(JointSpaceArm):
         Keys: ``kind``, ``joint_names``, ``revolute``, ``axis``, ``position``, ``rotation`` (in the frame of
         the joint before), ``home``, ``followers`` (joint, and the joint it follows) and their
         ``multipliers``, ``tip`` in the last frame and ``tip_frame`` at home; of the bodies ``body_names``,
-        ``links`` (their points: base, joints, tip, then those of bodies) and ``joined`` (their ends; bodies
+        ``links`` (the two ends or the vertices of each, padded by the last one, among these points: base, joints, tip,
+        then those of bodies) and ``joined`` (their ends; bodies
         with one in common are neighbours), ``points`` of bodies in the frames of their ``carriers``, numbers
         of joints that move them, and ``touching`` pairs, which are not kept apart.
         """
         chain, bodies = self.chain, self.bodies
-        keys = ("revolute", "axis", "position", "rotation", "tip", "points", "carriers")
-        geometry = {key: getattr(chain, key) for key in keys}
+        keys = ("revolute", "axis", "position", "rotation", "tip")
+        geometry = {key: getattr(chain, key) for key in keys} | self._recorded_bodies()
         arrays = {
             "home": self.home_configuration[:-6],
             "followers": np.array([one[:2] for one in self.followers], dtype=np.int64).reshape(-1, 2),
             "multipliers": np.array([one.multiplier for one in self.followers]),
             "tip_frame": self.end_effector.frame,
-            "links": bodies.points,
             "joined": bodies.joints,
             "touching": bodies.touching,
             **geometry,
@@ -277,6 +291,20 @@ class SerialArm(JointSpaceArm):
         names = {"joint_names": list(self.quantity_names), "body_names": list(bodies.names)}
         lists = {key: array.tolist() for key, array in arrays.items()}
         return {**super().record(), "kind": self.kind, **names, **lists}
+
+    def _recorded_bodies(self) -> dict[str, Array | Index]:
+        """Return the keys ``links``, ``points`` and ``carriers`` of the record."""
+        none = np.zeros(0, dtype=np.int64)
+        if self._vertices is None:
+            return {"links": self.bodies.points, "points": none.reshape(0, 3), "carriers": none}
+        counts = [len(vertices) for vertices in self._vertices]
+        first = len(self.chain) + 2 + np.cumsum([0, *counts[:-1]])
+        every, last = np.arange(max(counts, default=2)), np.array(counts)[:, None] - 1
+        return {
+            "links": first[:, None] + np.minimum(every, last),
+            "points": np.concatenate(self._vertices),
+            "carriers": np.repeat(self._carriers(), counts),
+        }
 
 
 def _or_infinite(limits: Sequence[float | None]) -> Array:

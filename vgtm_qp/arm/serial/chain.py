@@ -11,6 +11,7 @@ import numpy as np
 
 from vgtm_qp.arm.symbols import rotated
 from vgtm_qp.arrays import Array, Index, Mask
+from vgtm_qp.geometry.bodies import Hull
 from vgtm_qp.problem.arm import ArmBody, ArmTable
 from vgtm_qp.rotation import rotation_from_vector
 
@@ -38,9 +39,11 @@ class SerialChain:
     every : int
         Every `every`-th joint is a station between the base and the tip, see :attr:`tracked`.
     points : (P, 3)
-        Points of bodies, in the frames that they move with, m.
+        Points that span bodies, in the frames that they move with, m.
     carriers : (P,) int
         Numbers of joints that move them: 0 in the base's frame.
+    beyond : (P,)
+        Greatest distance of the body that each point spans, without its radius, from the origin of that frame, m.
     """
 
     revolute: Mask
@@ -51,15 +54,20 @@ class SerialChain:
     every: int
     points: Array
     carriers: Index
+    beyond: Array
 
     @classmethod
-    def of(cls, spec: ArmTable) -> SerialChain:
-        """Return the chain of an ``[arm]`` table; without its key `every` only base and tip are stations."""
+    def of(cls, spec: ArmTable, hulls: Sequence[Hull | None]) -> SerialChain:
+        """Return the chain of an ``[arm]`` table whose bodies have `hulls`, or are capsules.
+
+        Without its key `every` only base and tip are stations.
+        """
         joints, number = spec.joint, {joint.name: k + 1 for k, joint in enumerate(spec.joint)}
         carried = [
-            (point, number[body.joint] if body.joint else 0)
-            for body in spec.body or ()
-            for point in ends_of(body)
+            (point, number[body.joint] if body.joint else 0, float(np.linalg.norm(vertices, axis=1).max()))
+            for body, hull in zip(spec.body or (), hulls, strict=True)
+            for span, vertices in [vertices_of(body, hull)]
+            for point in span
         ]
         axis = np.array([joint.axis for joint in joints], dtype=float)
         return cls(
@@ -69,8 +77,9 @@ class SerialChain:
             rotation=np.stack([rotation_from_vector(joint.rotation_vector) for joint in joints]),
             tip=np.array(spec.tip, dtype=float),
             every=spec.every or len(joints),
-            points=np.array([point for point, _ in carried], dtype=float).reshape(-1, 3),
-            carriers=np.array([carrier for _, carrier in carried], dtype=np.int64),
+            points=np.array([point for point, _, _ in carried], dtype=float).reshape(-1, 3),
+            carriers=np.array([carrier for _, carrier, _ in carried], dtype=np.int64),
+            beyond=np.array([beyond for _, _, beyond in carried], dtype=float),
         )
 
     def __len__(self) -> int:
@@ -217,6 +226,19 @@ def _columns(nodes: int, joints: int) -> ca.Function:
     arguments = [direction, place, turns, number, moving, every]
     column = ca.Function("column", arguments, [ca.densify(ca.vertcat(*columns))])
     return column.map("columns", "serial", joints, [4, 5], [])
+
+
+def hull_of(body: ArmBody) -> Hull | None:
+    """Return the hull of a body; None for a ball or capsule."""
+    return Hull.of(body.points) if len(body.points) > 2 else None
+
+
+def vertices_of(body: ArmBody, hull: Hull | None) -> tuple[Array, Array]:
+    """Return the points that span a body, and all of its vertices, m: the ends of its axis, or those of its hull."""
+    if hull is None:
+        ends = ends_of(body)
+        return ends, ends
+    return hull.simplex, np.array(body.points, dtype=float)
 
 
 def ends_of(body: ArmBody) -> Array:

@@ -57,7 +57,7 @@ class UrdfJoint:
 
 @dataclass(frozen=True, eq=False)
 class UrdfBody:
-    """A capsule that encloses one collision shape.
+    """What stands for one collision shape: a ball, a capsule or a convex hull.
 
     Attributes
     ----------
@@ -65,8 +65,8 @@ class UrdfBody:
         That of its link; ``"link[2]"`` for the second shape of a link.
     joint : int
         Number of moving joints before it; 0 is fixed to the base.
-    points : (1 or 2, 3)
-        Centre or both ends of its axis, m, in the frame of the last of these joints.
+    points : (K, 3)
+        Centre, both ends of its axis, or four points or more of the hull, m, in the frame of the last of these joints.
     radius : float
         m.
     """
@@ -110,6 +110,7 @@ def read_urdf(
     base_link: str | None = None,
     tip_link: str | None = None,
     package_path: Sequence[str | Path] = (),
+    bodies: str = "hull",
 ) -> UrdfArm:
     """Read the arm between two links of a URDF file.
 
@@ -121,6 +122,8 @@ def read_urdf(
         By default the root, and the end with the most moving joints.
     package_path
         Folders in which ``package://`` files are looked up, before those beside the file and above it.
+    bodies
+        What stands for collision shapes: ``"hull"``, ``"capsule"`` or ``"primitives"``, as in ``[arm]``.
 
     Raises
     ------
@@ -133,10 +136,10 @@ def read_urdf(
     base, tip = tree.ends(base_link, tip_link)
     chain = tree.chain(base, tip)
     joints, tip_frame = tree.moving(chain)
-    shapes = Shapes(path.absolute(), [Path(place).absolute() for place in package_path], mistakes)
-    bodies, notes = tree.bodies(chain, base, shapes)
+    shapes = Shapes(path.absolute(), [Path(place).absolute() for place in package_path], mistakes, bodies)
+    found, notes = tree.bodies(chain, base, shapes)
     mistakes.stop()
-    return UrdfArm(joints, *tip_frame, bodies, base, tip, notes, (path, *shapes.files))
+    return UrdfArm(joints, *tip_frame, found, base, tip, notes, (path, *shapes.files))
 
 
 @dataclass(frozen=True, eq=False)
@@ -331,7 +334,7 @@ class _Tree:
             element = self._links[link]
             if not element.all("collision") and element.all("visual"):
                 notes.append(f'link "{link}" has no collision shape')
-            bodies += self._enclosed(link, number, frame, shapes)
+            bodies += self._bodies(link, number, frame, shapes)
         bodies.sort(key=lambda body: body.joint)
         return tuple(bodies), tuple(notes)
 
@@ -340,16 +343,16 @@ class _Tree:
         above = self._above.get(link)
         return self._below[link] + ([] if above is None else [above])
 
-    def _enclosed(self, link: str, number: int, frame: Frame, shapes: Shapes) -> list[UrdfBody]:
+    def _bodies(self, link: str, number: int, frame: Frame, shapes: Shapes) -> list[UrdfBody]:
         found = []
         for k, collision in enumerate(self._links[link].all("collision"), start=1):
             what = f'link "{link}", <collision>'
             origin, turn = after(frame, self._origins.of(collision, what))
-            capsule = shapes.enclosing(collision, what)
-            if capsule is not None:
-                ends, radius = capsule
+            body = shapes.body(collision, what)
+            if body is not None:
+                points, radius = body
                 name = link if k == 1 else f"{link}[{k}]"
-                found.append(UrdfBody(name, number, origin + ends @ turn.T, radius))
+                found.append(UrdfBody(name, number, origin + points @ turn.T, radius))
         return found
 
     def _moving(self, joint: _Joint, frame: Frame) -> UrdfJoint:

@@ -1,4 +1,4 @@
-"""Collision shapes of a URDF, each enclosed by a capsule."""
+"""Collision shapes of a URDF, as balls, capsules and points of hulls."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from vgtm_qp.arrays import Array
 from vgtm_qp.errors import MissingExtraError, ProblemError
-from vgtm_qp.problem.enclosing import Capsule, capsule_along, enclosing_capsule
+from vgtm_qp.problem.enclosing import capsule_along, enclosing_capsule, enclosing_prism, spans_volume
 from vgtm_qp.problem.urdf.text import Element, Mistakes
 
 _GREATEST_POINTS = 2_000_000
@@ -21,19 +21,23 @@ _HEAD = 1_000_000
 _KINDS = "box, cylinder, sphere, capsule, mesh"
 
 
-class Shapes:
-    """Encloses collision shapes; finds the files of their meshes.
+Points = tuple[Array, float]
+"""A ball's centre (1, 3), both ends of a capsule's axis (2, 3), or points (K, 3) of a hull; and the radius, m."""
 
-    `files` are the files that were read.
+
+class Shapes:
+    """Makes bodies of collision shapes; finds the files of their meshes.
+
+    `bodies` says what they become, as the key of ``[arm]`` does. `files` are the files that were read.
     """
 
-    def __init__(self, urdf: Path, packages: Sequence[Path], mistakes: Mistakes) -> None:
-        self._urdf, self._packages, self._mistakes = urdf, packages, mistakes
+    def __init__(self, urdf: Path, packages: Sequence[Path], mistakes: Mistakes, bodies: str) -> None:
+        self._urdf, self._packages, self._mistakes, self._bodies = urdf, packages, mistakes, bodies
         self.files: list[Path] = []
         self._meshes: dict[Path, Array] = {}
 
-    def enclosing(self, collision: Element, what: str) -> Capsule | None:
-        """Return the capsule round a <collision> in the frame of its <origin>; None where the shape is wrong."""
+    def body(self, collision: Element, what: str) -> Points | None:
+        """Return what stands for a <collision>, in the frame of its <origin>; None where the shape is wrong."""
         geometry = collision.first("geometry")
         shapes = [] if geometry is None else geometry.children
         if geometry is None or len(shapes) != 1:
@@ -48,16 +52,31 @@ class Shapes:
             return np.array([[0.0, 0.0, -half], [0.0, 0.0, half]]), mistakes.length(shape, what, "radius")
         if shape.tag == "cylinder":
             half = 0.5 * mistakes.length(shape, what, "length")
-            rim = np.full(2, mistakes.length(shape, what, "radius"))
-            return capsule_along(np.zeros(3), np.array([0.0, 0.0, 1.0]), np.array([-half, half]), rim)
+            radius = mistakes.length(shape, what, "radius")
+            if self._bodies == "capsule":
+                along = np.array([-half, half])
+                return capsule_along(np.zeros(3), np.array([0.0, 0.0, 1.0]), along, np.full(2, radius))
+            return self._hull(enclosing_prism(radius, half))
         if shape.tag == "box":
             corners = np.array(np.meshgrid(*[(-0.5, 0.5)] * 3)).reshape(3, -1).T
-            return enclosing_capsule(corners * mistakes.lengths(shape, what, "size", 3))
+            return self._hull(corners * mistakes.lengths(shape, what, "size", 3))
         if shape.tag == "mesh":
+            if self._bodies == "primitives":
+                expected = (
+                    'box, cylinder, sphere or capsule: bodies = "primitives" takes no meshes, "hull" does'
+                )
+                mistakes.add(shape, what, "<mesh>", expected)
+                return None
             points = self._mesh(shape, what)
-            return None if points is None else enclosing_capsule(points)
+            return None if points is None else self._hull(points)
         mistakes.add(shape, what, f"<{shape.tag}>", f"one of {_KINDS}")
         return None
+
+    def _hull(self, points: Array) -> Points:
+        """Return the hull of points (K, 3), or a capsule round them if capsules are wanted or they are in one plane."""
+        if self._bodies == "capsule" or not spans_volume(points):
+            return enclosing_capsule(points)
+        return points, 0.0
 
     def _mesh(self, shape: Element, what: str) -> Array | None:
         """Return points (K, 3) whose convex hull holds a mesh, m."""
