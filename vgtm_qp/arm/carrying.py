@@ -102,15 +102,10 @@ class Carrier:
         with_tip = np.stack(np.meshgrid(at_tip, new), axis=-1).reshape(-1, 2)
         among = new[np.stack(np.triu_indices(count, 1), axis=1)]
         names = [body.name for body in carried for _ in body.radius]
-        self.bodies = replace(
-            own,
-            points=np.concatenate([own.points, self._first + pairs]),
-            radius=np.concatenate([own.radius, *(body.radius for body in carried)]),
-            joints=np.concatenate([own.joints, int(own.joints.max(initial=-1)) + 1 + pairs]),
-            names=(*own.names, *names),
-            touching=np.concatenate([own.touching, with_tip, among]),
-            carried=count,
-        )
+        radius = np.concatenate([body.radius for body in carried])
+        joints = int(own.joints.max(initial=-1)) + 1 + pairs
+        both = own.joined(self._first + pairs, radius, joints, names)
+        self.bodies = replace(both, touching=np.concatenate([own.touching, with_tip, among]))
 
     @property
     def leaves_chords(self) -> bool:

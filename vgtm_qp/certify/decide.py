@@ -50,7 +50,7 @@ def decide(motion: GivenMotion, kept: Sequence[Kept]) -> dict[str, Decision]:
 
 @dataclass
 class _Edge:
-    """Pairs (P,) at instants: points (P, 2 V, 3), distances (P,), m, normals (P, 3), and the gaps of their planes, m."""
+    """Pairs (P,) at instants: points (P, 2 V, 3), distances (P,), normals (P, 3), and the gaps of their planes; m."""
 
     points: Array
     distance: Array

@@ -77,7 +77,7 @@ def mjcf(maneuver: Result) -> str:
     _add(world, "light", pos=(0.0, 0.0, 0.0), dir=(-0.3, 0.5, -0.8), directional="true", diffuse=_LIGHT)
     names = [str(node) for node in maneuver.manifest["arm"].get("node_names") or ()]
     if isinstance(arm, RecordedChain):
-        _add_joints(world, arm)
+        _add_joints(asset, world, arm)
     else:
         _add_nodes(world, arm, names)
     obstacles = drawing.obstacles
@@ -150,7 +150,7 @@ def _add_nodes(world: Element, arm: RecordedArm, names: list[str]) -> None:
         _add(body, "site", name=name, size=0.5 * radius)
 
 
-def _add_joints(world: Element, arm: RecordedChain) -> None:
+def _add_joints(asset: Element, world: Element, arm: RecordedChain) -> None:
     """Add the joints of a serial arm, each a body in the one before, with the links that move with them."""
     parent = _add(world, "body", name="base", mocap="true", pos=(0.0, 0.0, 0.0))
     bodies = [parent]
@@ -164,24 +164,26 @@ def _add_joints(world: Element, arm: RecordedChain) -> None:
     _add(parent, "site", name="tip", pos=arm.tip, size=max(float(np.median(arm.radius)), _THINNEST))
     for k, name in enumerate(arm.member_names):
         carrier, ends = _carried(arm, k)
-        length = float(np.linalg.norm(ends[1] - ends[0]))
-        look = {
-            "size": max(arm.radius[k], _THINNEST),
-            "rgba": (*FIXED_COLOUR, 1.0),
-            "contype": 1,
-            "conaffinity": 2,
-        }
-        mass = MASS_PER_LENGTH * max(length, 2.0 * float(arm.radius[k]))
-        _add(bodies[carrier], "geom", name=name, type="capsule", fromto=ends, mass=mass, **look)
+        look: dict[str, Any] = {"rgba": (*FIXED_COLOUR, 1.0), "contype": 1, "conaffinity": 2}
+        look["mass"] = MASS_PER_LENGTH * max(float(arm.length[k]), 2.0 * float(arm.radius[k]))
+        if arm.is_hull[k]:
+            _add(asset, "mesh", name=f"link {name}", vertex=ends)
+            look |= {"type": "mesh", "mesh": f"link {name}"}
+        else:
+            look |= {"type": "capsule", "fromto": ends, "size": max(arm.radius[k], _THINNEST)}
+        _add(bodies[carrier], "geom", name=name, **look)
 
 
 def _carried(arm: RecordedChain, link: int) -> tuple[int, Array]:
-    """Return the number of the joint that moves a link, 0 for the base, and its ends (2, 3) in that frame, m."""
+    """Return the number of the joint that moves a link, 0 for the base, and its points (K, 3) in that frame, m."""
     count, places = len(arm.quantity_names), np.vstack([arm.position, arm.tip])
+    if arm.is_hull[link]:
+        vertices = np.unique(arm.links[link]) - count - 2
+        return int(arm.carriers[vertices[0]]), arm.points[vertices]
     # Each point is fixed in one frame, or in two: the origin of a revolute joint in those before and after
     # it.
     known: list[dict[int, Array]] = []
-    for point in arm.links[link].tolist():
+    for point in arm.links[link, :2].tolist():
         if point > count + 1:
             known.append({int(arm.carriers[point - count - 2]): arm.points[point - count - 2]})
         elif point == 0:

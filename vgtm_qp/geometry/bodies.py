@@ -137,7 +137,7 @@ class Bodies:
 
     @cached_property
     def weights(self) -> Array:
-        """(B, V, 4) weights of the four points of each body in its vertices, some of which stand there several times."""
+        """(B, V, 4) weights of the four points of each body in its vertices, some of which are repeated."""
         most = max((len(hull.vertices) for hull in self.hulls if hull is not None), default=_CAPSULE)
         every = np.arange(most)
         weights = np.tile(np.eye(_HULL)[every % _CAPSULE], (len(self), 1, 1))

@@ -120,7 +120,7 @@ class Candidates:
     def _renew_pieces(self, X: Array, time: float, horizon: float) -> None:
         """List the pairs of a body and a piece that are nearer than `horizon`, m, at `X`, the new reference."""
         groups = _groups_with_pieces(X, self._scene, time, horizon)
-        self._lists[_TO_PIECES].renew(groups, X, time, horizon if groups else np.inf)
+        self._lists[_TO_PIECES].renew(groups, X, time, horizon if len(self._scene.pieces) else np.inf)
 
     def renew_bodies(self, X: Array, time: float, horizon: float) -> None:
         """List the pairs of two bodies that are nearer than `horizon`, m, at `X`, the new reference."""

@@ -310,8 +310,8 @@ def _nearest(
     """Return nearest points (3,) of a hull and of another convex body, m, and the normal (3,); None if they overlap.
 
     The point nearest to the origin among convex combinations of differences of points, to which the difference that
-    is furthest towards it is added until none is further, from that along `normal` (P. Wolfe, "Finding the nearest point in a polytope",
-    Math. Program. 11, 1976); the combination is a least-squares problem without negative weights.
+    is furthest towards it is added until none is further, first along `normal` (P. Wolfe, "Finding the nearest point
+    in a polytope", Math. Program. 11, 1976). The combination is a least-squares problem without negative weights.
     """
     if normal is None:
         normal = vertices.mean(axis=0) - support(np.array([0.0, 0.0, 1.0]))

@@ -168,6 +168,9 @@ def free_place(session: Session, radius: float, room: float) -> Array:
     """
     arm, nodes = session.drawing.arm, session.nodes
     ends = arm.ends(nodes)
+    # A hull is in a ball round one of its vertices.
+    reach = np.linalg.norm(ends - ends[:, :1], axis=2).max(axis=1)
+    thick = arm.radius + np.where(arm.is_hull, reach, 0.0)
     middle = (nodes.min(axis=0) + nodes.max(axis=0)) / 2
     time = session.state.time
     others = [
@@ -180,7 +183,7 @@ def free_place(session: Session, radius: float, room: float) -> Array:
     while True:
         for angle in _ANGLES:
             center = middle + away * np.array([np.cos(angle), np.sin(angle), 0.0])
-            is_clear = float(np.min(_distances(center, ends) - arm.radius)) >= least
+            is_clear = float(np.min(_distances(center, ends[:, :2]) - thick)) >= least
             if is_clear and all(np.linalg.norm(center - np.clip(center, *box)) >= radius for box in others):
                 return np.asarray(center)
         away += 0.25 * least

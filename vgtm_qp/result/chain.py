@@ -210,7 +210,7 @@ class RecordedChain:
         return np.asarray(points[..., self.links, :])
 
     def lengths(self, points: Array) -> Array:
-        """Return (..., B) the lengths of the links, m, for points (..., J + 2 + P, 3): of hulls, of boxes round them."""
+        """Return (..., B) the lengths of the links, m, for points (..., J + 2 + P, 3): those of boxes round hulls."""
         return np.asarray(np.linalg.norm(np.ptp(self.ends(points), axis=-2), axis=-1))
 
     def quantities(self, q: Array) -> Array:

@@ -40,7 +40,8 @@ _CHUNK = 200_000
 class RecordedMotion:
     """The moving arm: times (T,), s, and states, which are nodes (T, N, 3), m, or joints and base (T, J + 6).
 
-    The ends (T, M, V, 3), m, are those of its bodies at the states, or their vertices. In names the states count from `first` on.
+    The ends (T, M, V, 3), m, are those of its bodies at the states, or their vertices. In names the states count from
+    `first` on.
     """
 
     def __init__(self, arm: Arm | CarryingArm, time: Array, states: Array, first: int = 0) -> None:

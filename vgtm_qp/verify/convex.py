@@ -24,7 +24,7 @@ _EXACT = 1e-13
 """Gap between upper and lower bound of a distance that ends the search, over the size of what is far from what."""
 _TOUCHING = 1e-12
 """Distance, over the same size, below which two bodies overlap."""
-_SUBSETS = [list(s) for count in (1, 2, 3, 4) for s in itertools.combinations(range(4), count)]
+_SUBSETS = [list(s) for count in (1, 2, 3) for s in itertools.combinations(range(3), count)]
 _WAYS: Array = np.array([way for way in itertools.product((-1.0, 0.0, 1.0), repeat=3) if any(way)])
 """Directions in which the depth of overlapping bodies is measured."""
 
@@ -42,7 +42,7 @@ def hull_distance(vertices: Array, furthest: Furthest) -> Separation:
     length = np.linalg.norm(direction, axis=1)
     normal = np.where(length[:, None] > 0.0, direction / np.maximum(length, 1e-300)[:, None], [0.0, 0.0, 1.0])
     rows, upper = every, np.full(count, np.inf)
-    simplex, used = np.zeros((count, 4, 3)), np.zeros((count, 4), dtype=np.bool_)
+    corners, used = np.zeros((count, 3, 3)), np.zeros((count, 3), dtype=np.bool_)
     for _ in range(_MOST):
         if not len(rows):
             break
@@ -51,30 +51,31 @@ def hull_distance(vertices: Array, furthest: Furthest) -> Separation:
         gap = np.einsum("pc,pc->p", apart, normal)
         better = gap > lower[rows]
         lower[rows[better]], best[rows[better]] = gap[better], normal[better]
-        size = np.abs(apart).max(axis=1) + np.where(np.isfinite(upper), upper, 0.0)
-        going = upper - lower[rows] > _EXACT * size
-        rows, simplex, used, apart, size, upper = (
-            x[going] for x in (rows, simplex, used, apart, size, upper)
+        size = np.abs(apart).max(axis=1)
+        going = ~(upper - lower[rows] <= _EXACT * size)
+        rows, corners, used, apart, size, upper = (
+            x[going] for x in (rows, corners, used, apart, size, upper)
         )
-        slot = np.argmin(used, axis=1)
-        simplex[np.arange(len(rows)), slot], used[np.arange(len(rows)), slot] = apart, True
-        weights = _nearest_weights(simplex, used)
-        point = np.einsum("pk,pkc->pc", weights, simplex)
+        weights, point = _nearest(apart, corners, used)
         distance = np.linalg.norm(point, axis=1)
-        used = weights > 0.0
-        inside = (distance <= _TOUCHING * size) | used.all(axis=1)
+        kept = weights > 0.0
+        inside = (distance <= _TOUCHING * size) | kept.all(axis=1)
         overlap[rows[inside]] = True
         # Without progress rounding has the last word: the lower bound stands.
         going = ~inside & (distance < upper)
-        rows, simplex, used, upper = rows[going], simplex[going], used[going], distance[going]
+        rows, upper, kept = rows[going], distance[going], kept[going]
         normal = point[going] / upper[:, None]
+        order = np.argsort(~kept, axis=1, kind="stable")[:, :3]
+        every_corner = np.concatenate([apart[:, None], corners], axis=1)[going]
+        corners = np.take_along_axis(every_corner, order[..., None], axis=1)
+        used = np.take_along_axis(kept, order, axis=1)
     overlap &= lower <= 0.0
     lower[overlap], best[overlap] = _way_out(vertices[overlap], furthest, every[overlap])
     return lower, best
 
 
 def _way_out(vertices: Array, furthest: Furthest, rows: Index) -> Separation:
-    """Return the gaps (Q,), m, of overlapping bodies, which are below zero, along the best of some directions (Q, 3)."""
+    """Return the gaps (Q,), m, of overlapping bodies along the best (Q, 3) of some directions."""
     found, best = np.full(len(rows), -np.inf), np.zeros((len(rows), 3))
     for way in _WAYS / np.linalg.norm(_WAYS, axis=1)[:, None] if len(rows) else ():
         normal = np.tile(way, (len(rows), 1))
@@ -85,32 +86,39 @@ def _way_out(vertices: Array, furthest: Furthest, rows: Index) -> Separation:
     return np.minimum(found, 0.0), best
 
 
-def _nearest_weights(simplex: Array, used: NDArray[np.bool_]) -> Array:
-    """Return the weights (P, 4) of the point nearest to the origin among means of the used corners (P, 4, 3).
+def _nearest(new: Array, corners: Array, used: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """Return weights (P, 4) and place (P, 3) of the point nearest to the origin in simplices.
 
-    For each subset of corners the cofactors of Johnson's recursion are the weights of the point nearest in its plane,
-    if all are above zero.
+    Its corners are `new` (P, 3), which has a share in that point, and those `used` (P, 3) of `corners` (P, 3, 3). For
+    each subset of these the point nearest in its plane counts if it is within the subset.
     """
-    product = np.einsum("pkc,plc->pkl", simplex, simplex)
-    cofactors: dict[tuple[int, ...], Array] = {}
-    least, best = np.full(len(simplex), np.inf), np.zeros((len(simplex), 4))
+    edges = corners - new[:, None]
+    gram, right = np.einsum("pkc,plc->pkl", edges, edges), -np.einsum("pkc,pc->pk", edges, new)
+    best, place = np.zeros((len(new), 4)), new.copy()
+    best[:, 0] = 1.0
+    least = np.einsum("pc,pc->p", new, new)
     for subset in _SUBSETS:
-        found = np.zeros((len(simplex), 4))
-        for corner in subset:
-            rest = tuple(k for k in subset if k != corner)
-            found[:, corner] = (
-                1.0
-                if not rest
-                else sum(
-                    cofactors[rest][:, i] * (product[:, i, rest[0]] - product[:, i, corner]) for i in rest
-                )
-            )
-        cofactors[tuple(subset)] = found
-        total = found.sum(axis=1)
-        valid = used[:, subset].all(axis=1) & (found[:, subset] > 0.0).all(axis=1)
-        weights = found / np.where(valid, total, 1.0)[:, None]
-        square = np.einsum("pkc,pk->pc", simplex, weights)
-        square = np.einsum("pc,pc->p", square, square)
-        better = valid & (square < least)
-        least[better], best[better] = square[better], weights[better]
-    return best
+        share, whole = _solved(gram[:, subset][:, :, subset], right[:, subset])
+        valid = used[:, subset].all(axis=1) & (whole > 0.0)
+        share = share / np.where(valid, whole, 1.0)[:, None]
+        rest = 1.0 - share.sum(axis=1)
+        point = new + np.einsum("pk,pkc->pc", share, edges[:, subset])
+        square = np.einsum("pc,pc->p", point, point)
+        better = valid & (share > 0.0).all(axis=1) & (rest > 0.0) & (square < least)
+        weights = np.zeros((len(new), 4))
+        weights[:, 0], weights[:, [k + 1 for k in subset]] = rest, share
+        least[better], best[better], place[better] = square[better], weights[better], point[better]
+    return best, place
+
+
+def _solved(gram: Array, right: Array) -> tuple[Array, Array]:
+    """Return x (P, k) and d (P,) for which `gram` x = d `right`, by Cramer's rule, for up to three unknowns."""
+    if gram.shape[1] == 1:
+        return right, gram[:, 0, 0]
+    if gram.shape[1] == 2:
+        (a, b), (_, d), (r, s) = gram[:, 0].T, gram[:, 1].T, right.T
+        return np.stack([r * d - s * b, s * a - r * b], axis=1), a * d - b * b
+    columns = np.moveaxis(gram, 2, 0)
+    across = [np.cross(columns[k - 2], columns[k - 1]) for k in range(3)]
+    whole = np.einsum("pc,pc->p", columns[0], across[0])
+    return np.stack([np.einsum("pc,pc->p", right, one) for one in across], axis=1), whole

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,6 +12,8 @@ import numpy as np
 
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.curve.families import make_family
+from vgtm_qp.geometry.bodies import Hull
+from vgtm_qp.result.chain import RecordedChain
 from vgtm_qp.result.manifest import scene_problem
 from vgtm_qp.result.result import Result
 from vgtm_qp.rotation import rotation_from_vector
@@ -98,6 +101,49 @@ class CarriedMesh(ObstacleMesh):
 
 
 @dataclass(frozen=True, eq=False)
+class DrawnHull:
+    """The surface of a body that is a convex hull.
+
+    Attributes
+    ----------
+    body : int
+        Its number.
+    rows : (K,) int
+        The nodes that are its vertices.
+    home : (K, 3)
+        Where they are at home, about the middle of the hull, m.
+    vertices, faces : (V, 3), (F, 3) int
+        Its surface there, m.
+    """
+
+    body: int
+    rows: Index
+    home: Array
+    vertices: Array
+    faces: Index
+
+    @classmethod
+    def of(cls, body: int, rows: Index, home: Array) -> DrawnHull:
+        """Return the hull of nodes `rows` (K,), which are at `home` (K, 3), m."""
+        about = home - home.mean(axis=0)
+        hull = Hull.of(about)
+        return cls(body, rows, about, hull.vertices, hull.faces)
+
+    def pose(self, nodes: Array) -> tuple[Array, Array]:
+        """Return position (3,), m, and rotation (3, 3) of the hull for nodes at `nodes` (N, 3), m."""
+        now = nodes[self.rows]
+        middle = now.mean(axis=0)
+        left, _, right = np.linalg.svd((now - middle).T @ self.home)
+        sign = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
+        return middle, np.asarray((left * sign) @ right)
+
+    def placed(self, nodes: Array) -> Array:
+        """Return (V, 3) its vertices for nodes at `nodes` (N, 3), m."""
+        position, rotation = self.pose(nodes)
+        return np.asarray(position + self.vertices @ rotation.T)
+
+
+@dataclass(frozen=True, eq=False)
 class Drawing:
     """An arm and its surroundings, ready to be drawn at any configuration.
 
@@ -108,6 +154,21 @@ class Drawing:
     arm: Arm
     curve_weights: Array
     obstacles: tuple[ObstacleMesh, ...]
+
+    @cached_property
+    def hulls(self) -> tuple[DrawnHull, ...]:
+        """The bodies that are convex hulls; all others are drawn from end to end."""
+        if not isinstance(self.arm, RecordedChain):
+            return ()
+        links, home = self.arm.links, self.arm.home
+        own = [(body, np.unique(links[body])) for body in np.flatnonzero(self.arm.is_hull).tolist()]
+        return tuple(DrawnHull.of(body, rows, home[rows]) for body, rows in own)
+
+    @cached_property
+    def marks(self) -> Index:
+        """The nodes that are drawn: all but the vertices of hulls."""
+        rows = np.concatenate([np.zeros(0, dtype=np.int64), *(hull.rows for hull in self.hulls)])
+        return np.setdiff1d(np.arange(len(self.arm.home)), rows)
 
     def surfaces(self) -> list[Array]:
         """Return (K, 3) the vertices of each obstacle at time 0, or where it is later taken up, m."""

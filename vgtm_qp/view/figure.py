@@ -30,6 +30,7 @@ from vgtm_qp.view.drawing import (
     OBSTACLE_COLOUR,
     PATH_COLOUR,
     POLYGON_COLOUR,
+    ObstacleMesh,
     drawing_of_maneuver,
     heading,
     off_curve,
@@ -352,12 +353,14 @@ class View:
         surfaces = sorted(self._there(time), key=lambda surface: surface.depth(time))
         for k, surface in enumerate(surfaces, start=1):
             _draw_surface(axes, surface, time, 2.0 * k)
-        ends = drawing.arm.ends(nodes)
+        self._draw_hulls(axes, shown, surfaces)
+        drawn = ~drawing.arm.is_hull
+        ends = drawing.arm.ends(nodes)[drawn, :2]
         cuts = _PIECES if len(ends) <= _MANY_MEMBERS else 1
         cut, bare = pieces(ends, cuts), pieces(ends, cuts, overlap=0.0)
-        width = np.repeat(np.maximum(2.0 * drawing.arm.radius * scale, _THINNEST), cuts)
+        width = np.repeat(np.maximum(2.0 * drawing.arm.radius[drawn] * scale, _THINNEST), cuts)
         balls = self._balls(nodes, scale)
-        colour = np.repeat(drawing.colours(shown.lengths), cuts, axis=0)
+        colour = np.repeat(drawing.colours(shown.lengths)[drawn], cuts, axis=0)
         middles = cut.mean(axis=1)
         depth, layer = projection.depth(middles), layers(middles, surfaces, time)
         ball_depth, ball_layer = projection.depth(balls.centre), layers(balls.centre, surfaces, time)
@@ -386,16 +389,35 @@ class View:
             axes.plot(*projection.flat(vertices).T, **_POLYGON)
             axes.plot(*projection.flat(drawing.curve(vertices)).T, path_effects=effects, **_CURVE)
 
+    def _draw_hulls(self, axes: Axes, shown: _Shown, surfaces: list[ProjectedMesh]) -> None:
+        """Draw the bodies that are hulls, farthest first."""
+        if not (hulls := self.drawing.hulls):
+            return
+        still = np.zeros(3), np.zeros(3)
+        solids = [
+            ProjectedMesh(ObstacleMesh("", hull.placed(shown.nodes), hull.faces, *still), self.projection)
+            for hull in hulls
+        ]
+        middles = np.stack([solid.vertices.mean(axis=0) for solid in solids])
+        layer, depth = layers(middles, surfaces, shown.time), [solid.depth(0.0) for solid in solids]
+        for rank, k in enumerate(np.argsort(depth).tolist()):
+            zorder = 2.0 * float(layer[k]) + 1.0 + rank / (2.0 * len(solids))
+            face: Any = {"facecolors": [FIXED_COLOUR], "edgecolors": [DARK], "linewidths": 0.5 * CASING}
+            axes.add_collection(PolyCollection(solids[k].polygons(0.0), zorder=zorder, **face))
+            edges = list(solids[k].edges(0.0, seen=True))
+            axes.add_collection(LineCollection(edges, colors=[DARK], linewidths=0.3, zorder=zorder))
+
     def _balls(self, nodes: Array, scale: float) -> _Balls:
         """Return the nodes of a truss; of a serial arm the round ends of its links, and small marks at its joints."""
         arm = self.drawing.arm
-        width = np.maximum(2.0 * arm.radius * scale, _THINNEST)
+        drawn = ~arm.is_hull
+        width = np.maximum(2.0 * arm.radius[drawn] * scale, _THINNEST)
         if arm.stretches.any():
             same = np.full(len(nodes), 1.15 * float(np.median(width)) + CASING)
             return _Balls(nodes, same, np.tile(DARK, (len(nodes), 1)), np.full(len(nodes), 0.1))
         joints = nodes[1 : len(arm.quantity_names) + 1]
-        mark = np.full(len(joints), 0.35 * float(np.median(width)) + CASING)
-        ends, twice = arm.ends(nodes).reshape(-1, 3), np.repeat(width, 2)
+        mark = np.full(len(joints), 0.35 * float(np.median(width if len(width) else _THINNEST)) + CASING)
+        ends, twice = arm.ends(nodes)[drawn, :2].reshape(-1, 3), np.repeat(width, 2)
         colour = np.tile(FIXED_COLOUR, (len(ends), 1))
         # The dark casing of each end, the end itself, below the links; the marks above them.
         return _Balls(

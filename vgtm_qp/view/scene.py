@@ -19,6 +19,7 @@ from vgtm_qp.view.drawing import (
     POLYGON_COLOUR,
     Camera,
     Drawing,
+    DrawnHull,
     ObstacleMesh,
 )
 
@@ -41,8 +42,7 @@ class _DrawnObstacle:
     def place(self, time: float) -> None:
         """Put it where it is at `time`, s."""
         self.frame.position = self.mesh.position(time)
-        x, y, z, w = Rotation.from_matrix(self.mesh.rotation(time)).as_quat()
-        self.frame.wxyz = np.array([w, x, y, z])
+        self.frame.wxyz = _wxyz(self.mesh.rotation(time))
 
 
 def import_viser() -> Any:
@@ -83,15 +83,16 @@ class ArmScene:
         scales = np.column_stack([arm.radius, arm.radius, span]).astype(np.float32)
         colours = drawing.colours(arm.lengths(nodes))
         self._members = []
-        for name, which in (("fixed", ~arm.stretches), ("actuated", arm.stretches)):
+        for name, which in (("fixed", ~arm.stretches & ~arm.is_hull), ("actuated", arm.stretches)):
             if which.any():
                 placed = position[which], wxyz[which], colours[which]
                 handle = self._add_many(f"/members/{name}", tube, *placed, batched_scales=scales[which])
                 self._members.append((which, handle))
         ball = trimesh.creation.icosphere(subdivisions=2, radius=1.35 * float(np.median(arm.radius)))
-        unturned = np.tile([1.0, 0.0, 0.0, 0.0], (len(nodes), 1))
+        unturned = np.tile([1.0, 0.0, 0.0, 0.0], (len(drawing.marks), 1))
         dark = tuple(0.55 * channel for channel in FIXED_COLOUR)
-        self._nodes = self._add_many("/nodes", ball, nodes, unturned, dark)
+        self._nodes = self._add_many("/nodes", ball, nodes[drawing.marks], unturned, dark)
+        self._hulls = [(hull, self._add_hull(hull, nodes)) for hull in drawing.hulls]
         self._curve = self._polygon = self._vertices = None
         if drawing.curve_weights.size:
             points = drawing.curve(control_vertices)
@@ -135,7 +136,12 @@ class ArmScene:
                     handle.batched_scales = scales
                 if not np.array_equal(handle.batched_colors, colours[which]):
                     handle.batched_colors = colours[which]
-            self._nodes.batched_positions = numbers(nodes)
+            for hull, surface in self._hulls:
+                at, turn = hull.pose(nodes)
+                surface.position, surface.wxyz = numbers(at), numbers(_wxyz(turn))
+                if tuple(surface.color) != (colour := tuple(_rgb(shown[hull.body]).tolist())):
+                    surface.color = colour
+            self._nodes.batched_positions = numbers(nodes[self._drawing.marks])
             if self._curve is not None and self._polygon is not None and self._vertices is not None:
                 self._curve.points = numbers(_segments(self._drawing.curve(control_vertices)))
                 self._polygon.points = numbers(_segments(control_vertices))
@@ -211,6 +217,18 @@ class ArmScene:
             **more,
         )
 
+    def _add_hull(self, hull: DrawnHull, nodes: Array) -> Any:
+        position, rotation = hull.pose(nodes)
+        return self._scene.add_mesh_simple(
+            f"/members/{self._drawing.arm.member_names[hull.body]}",
+            hull.vertices.astype(np.float32),
+            hull.faces.astype(np.uint32),
+            color=_rgb(FIXED_COLOUR),
+            flat_shading=True,
+            position=position,
+            wxyz=_wxyz(rotation),
+        )
+
     def _add_obstacle(self, mesh: ObstacleMesh) -> _DrawnObstacle:
         path = _path(mesh)
         frame = self._scene.add_frame(path, show_axes=False)
@@ -251,7 +269,8 @@ def _path(mesh: ObstacleMesh) -> str:
 
 
 def _placement(ends: Array) -> tuple[Array, Array, Array]:
-    """Return middles (K, 3), quaternions (K, 4) that turn z along, spans (K,), of segments (K, 2, 3), m."""
+    """Return middles (K, 3), quaternions (K, 4) that turn z along, spans (K,), of the first two ends (K, V, 3), m."""
+    ends = ends[:, :2]
     along = ends[:, 1] - ends[:, 0]
     span = np.linalg.norm(along, axis=1)
     direction = along / np.maximum(span, 1e-12)[:, None]
@@ -259,6 +278,11 @@ def _placement(ends: Array) -> tuple[Array, Array, Array]:
     w = np.sqrt((1.0 + direction[:, 2]) / 2.0)
     wxyz = np.column_stack([w, -direction[:, 1] / (2.0 * w), direction[:, 0] / (2.0 * w), np.zeros(len(w))])
     return ends.mean(axis=1), wxyz, span
+
+
+def _wxyz(rotation: Array) -> Array:
+    """Return the quaternion w, x, y, z of a rotation (3, 3)."""
+    return np.roll(Rotation.from_matrix(rotation).as_quat(), 1)
 
 
 def _segments(points: Array) -> Array:
