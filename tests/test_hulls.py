@@ -86,12 +86,13 @@ def other_distance(scene, X, pair):
         ),
     ]
     if pair.other < len(kinds):
-        body, piece = kinds[pair.other], 0
+        body, pieces = kinds[pair.other], np.zeros(1, dtype=int)
     else:
         triangles = scene.monitor.pieces.parameters[3:, :9].reshape(-1, 3, 3)
         body = recorded.Body("", np.zeros(3), np.zeros(3), np.eye(3), recorded.mesh(triangles, closed=True))
-        piece = pair.other - 3
-    return body.hull_separation(vertices - body.center, np.array([piece]))[0][0] - radius
+        pieces = np.arange(len(triangles))
+    found, _ = body.hull_separation(np.tile(vertices - body.center, (len(pieces), 1, 1)), pieces)
+    return found.min() - radius
 
 
 @pytest.mark.property
@@ -106,7 +107,7 @@ def test_distances_agree_with_fcl_and_with_the_certificate(seed):
     assert claimed.keys() == computed.keys()
     for pair, (distance, _) in computed.items():
         assert claimed[pair][0] == pytest.approx(distance, abs=2e-6)
-    for pair, (distance, _) in least_rows(contacts).items():
+    for pair, (distance, _) in computed.items():
         if pair.body != 3:
             other = other_distance(exact, X, pair)
             if distance + RADII[pair.body] + (RADII[pair.other] if pair.is_self else 0.0) > 1e-6:
@@ -136,10 +137,13 @@ def test_rows_agree_with_finite_differences(seed):
 
     X, before, after = scene.points(poses), moved(-1.0), moved(1.0)
     contacts = scene.monitor.near(X, by_fcl=False)
-    found, (low, high) = least_rows(contacts), (least_rows(scene.monitor.near(at)) for at in (before, after))
+    found, low, high = (
+        least_rows(rows, by_obstacle=True)
+        for rows in (contacts, *(scene.monitor.near(at) for at in (before, after)))
+    )
     for pair, (distance, k) in found.items():
         # Where surfaces touch, or a triangle is pierced, the normal is another one.
-        if distance > 0.02 and pair in low and pair in high:
+        if distance > 0.02:
             change = (high[pair][0] - low[pair][0]) / 1e-6
             row = contacts.normal[k] @ (contacts.weights[k] @ (after - before)[contacts.points[k]]) / 1e-6
             # The normal of vertices and faces jumps from one to the next; that costs a distance nothing.
@@ -161,7 +165,6 @@ def test_what_is_proven_over_a_motion_holds_at_every_instant(seed, by_fcl):
             if report.certified:
                 assert floor <= report.clearance <= sampled + 1e-9
             else:
-                assert report.failing.distance.min() < floor
                 assert ((report.fraction > 0.0) & (report.fraction <= 1.0)).all()
 
 

@@ -11,7 +11,6 @@ import numpy as np
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.certify.motion import GivenMotion
 from vgtm_qp.verify.clearance import AgainstMembers, Pairs, box_gap
-from vgtm_qp.verify.convex import hull_distance
 from vgtm_qp.verify.distance import Separation
 from vgtm_qp.verify.obstacles import Body
 
@@ -193,10 +192,8 @@ class KeptBodies(Kept):
         distance, normal = shape.distance(points[:, 0], points[:, 1], sizes)
         hull = self.motion.arm.is_hull[pair[0]]
         if hull.any():
-            vertices, of_hulls = points[hull, : points.shape[1] // 2], sizes[hull]
-            distance[hull], normal[hull] = hull_distance(
-                vertices, lambda normal, rows: shape.furthest(normal, of_hulls[rows])
-            )
+            vertices = points[hull, : points.shape[1] // 2]
+            distance[hull], normal[hull] = shape.hull_distance(vertices, sizes[hull])
         return distance - self.motion.arm.radius[pair[0]], normal
 
     def apart(self, points: Array, normal: Array, pair: Pairs) -> Array:

@@ -8,7 +8,7 @@ the gap between two supporting planes: no distance is less, and it is the distan
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,14 +43,20 @@ def hull_distance(vertices: Array, furthest: Furthest) -> Separation:
     normal = np.where(length[:, None] > 0.0, direction / np.maximum(length, 1e-300)[:, None], [0.0, 0.0, 1.0])
     rows, upper = every, np.full(count, np.inf)
     corners, used = np.zeros((count, 3, 3)), np.zeros((count, 3), dtype=np.bool_)
+
+    def look(along: Array, rows: Index) -> Array:
+        """Return the differences (Q, 3) of the supporting points along normals (Q, 3), and keep the best gaps."""
+        near = np.einsum("pvc,pc->pv", vertices[rows], along).argmin(axis=1)
+        apart = vertices[rows, near] - furthest(along, rows)
+        gap = np.einsum("pc,pc->p", apart, along)
+        better = gap > lower[rows]
+        lower[rows[better]], best[rows[better]] = gap[better], along[better]
+        return np.asarray(apart)
+
     for _ in range(_MOST):
         if not len(rows):
             break
-        near = np.einsum("pvc,pc->pv", vertices[rows], normal).argmin(axis=1)
-        apart = vertices[rows, near] - furthest(normal, rows)
-        gap = np.einsum("pc,pc->p", apart, normal)
-        better = gap > lower[rows]
-        lower[rows[better]], best[rows[better]] = gap[better], normal[better]
+        apart = look(normal, rows)
         size = np.abs(apart).max(axis=1)
         going = ~(upper - lower[rows] <= _EXACT * size)
         rows, corners, used, apart, size, upper = (
@@ -61,8 +67,13 @@ def hull_distance(vertices: Array, furthest: Furthest) -> Separation:
         kept = weights > 0.0
         inside = (distance <= _TOUCHING * size) | kept.all(axis=1)
         overlap[rows[inside]] = True
-        # Without progress rounding has the last word: the lower bound stands.
         going = ~inside & (distance < upper)
+        # Rounding can hide in which subset the nearest point is: the normals of all are tried.
+        stalled = np.flatnonzero(~inside & ~going)
+        for along in _normals(apart[stalled], corners[stalled]) if len(stalled) else ():
+            length = np.linalg.norm(along, axis=1)
+            usable = length > 0.0
+            look(along[usable] / length[usable, None], rows[stalled[usable]])
         rows, upper, kept = rows[going], distance[going], kept[going]
         normal = point[going] / upper[:, None]
         order = np.argsort(~kept, axis=1, kind="stable")[:, :3]
@@ -109,6 +120,17 @@ def _nearest(new: Array, corners: Array, used: NDArray[np.bool_]) -> tuple[Array
         weights[:, 0], weights[:, [k + 1 for k in subset]] = rest, share
         least[better], best[better], place[better] = square[better], weights[better], point[better]
     return best, place
+
+
+def _normals(new: Array, corners: Array) -> Iterator[Array]:
+    """Yield normals (P, 3), of any length, of the planes, lines and points that corners with `new` span."""
+    edges = corners - new[:, None]
+    yield new
+    for k in range(3):
+        edge = edges[:, k]
+        yield np.cross(np.cross(edge, new), edge)
+        normal = np.cross(edges[:, k - 1], edge)
+        yield normal * np.sign(np.einsum("pc,pc->p", normal, new))[:, None]
 
 
 def _solved(gram: Array, right: Array) -> tuple[Array, Array]:

@@ -40,6 +40,13 @@ class Shape:
         """Return the greatest ``normal . x`` (P,) over the points x of pieces of `sizes` for normals (P, 3), m."""
         return np.asarray(np.einsum("pc,pc->p", normal, self.furthest(normal, sizes)))
 
+    def hull_distance(self, vertices: Array, sizes: Array) -> Separation:
+        """Return distances (P,) and normals (P, 3) of hulls of `vertices` (P, V, 3) against pieces of `sizes`."""
+        if self.furthest is _ball_furthest:
+            distance, normal = hull_distance(vertices, lambda normal, _: np.zeros_like(normal))
+            return distance - sizes, normal
+        return hull_distance(vertices, lambda normal, rows: self.furthest(normal, sizes[rows]))
+
 
 _BOX_CORNERS: Array = np.array([list(itertools.product((-1.0, 1.0), repeat=3))])
 
@@ -121,10 +128,7 @@ class Body:
 
     def hull_separation(self, vertices: Array, piece: Index) -> Separation:
         """Return distances and normals of P convex hulls of `vertices` (P, V, 3) against the pieces (P,)."""
-        sizes, shape = self.shape.sizes[piece], self.shape
-        distance, normal = hull_distance(
-            vertices @ self.rotation, lambda normal, rows: shape.furthest(normal, sizes[rows])
-        )
+        distance, normal = self.shape.hull_distance(vertices @ self.rotation, self.shape.sizes[piece])
         return distance, normal @ self.rotation.T
 
     def support(self, normal: Array, piece: Index) -> Array:
