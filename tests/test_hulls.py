@@ -51,6 +51,9 @@ class Scene:
         own = [ends if hull is None else hull.simplex for hull in self.hulls]
         return np.vstack([span @ R.T + t for span, (R, t) in zip(own, poses, strict=True)])
 
+    def near(self, X, by_fcl=False):
+        return self.monitor.near(X, 0.0, 10.0, self_reach=10.0, by_fcl=by_fcl)
+
     def vertices(self, X, body):
         """The vertices of a body whose points are at X."""
         hull, points = self.hulls[body], X[self.monitor.bodies.points[body]]
@@ -101,8 +104,9 @@ def other_distance(scene, X, pair):
 def test_distances_agree_with_fcl_and_with_the_certificate(seed):
     by_fcl, exact = Scene(seed), Scene(seed, by_fcl=False)
     X = by_fcl.points(by_fcl.poses())
-    fcl, contacts = by_fcl.monitor.near(X, by_fcl=True), exact.monitor.near(X)
-    assert fcl.by_fcl.any() and not contacts.by_fcl.any()
+    fcl, contacts = by_fcl.near(X, by_fcl=True), exact.near(X)
+    assert fcl.by_fcl.any()
+    assert not contacts.by_fcl.any()
     claimed, computed = (least_rows(found, by_obstacle=True) for found in (fcl, contacts))
     assert claimed.keys() == computed.keys()
     for pair, (distance, _) in computed.items():
@@ -136,10 +140,9 @@ def test_rows_agree_with_finite_differences(seed):
         )
 
     X, before, after = scene.points(poses), moved(-1.0), moved(1.0)
-    contacts = scene.monitor.near(X, by_fcl=False)
+    contacts = scene.near(X, by_fcl=False)
     found, low, high = (
-        least_rows(rows, by_obstacle=True)
-        for rows in (contacts, *(scene.monitor.near(at) for at in (before, after)))
+        least_rows(rows, by_obstacle=True) for rows in (contacts, *(scene.near(at) for at in (before, after)))
     )
     for pair, (distance, k) in found.items():
         # Where surfaces touch, or a triangle is pierced, the normal is another one.
@@ -176,11 +179,11 @@ def test_surfaces_that_overlap_are_parted_along_the_normal(seed):
     poses = scene.poses()
     poses[0] = poses[0][0], np.array([1.0, 0.0, 0.0]) + scene.rng.normal(size=3) * 0.05
     X = scene.points(poses)
-    contacts = scene.monitor.near(X, by_fcl=True)
+    contacts = scene.near(X, by_fcl=True)
     distance, k = next(row for pair, row in least_rows(contacts).items() if pair == (0, 0, False))
     assert distance < 0.0
     out = poses[0][1] - (distance - 1e-3) * contacts.normal[k]
-    parted = scene.monitor.near(scene.points([(poses[0][0], out), *poses[1:]]))
+    parted = scene.near(scene.points([(poses[0][0], out), *poses[1:]]))
     assert least_rows(parted)[(0, 0, False)][0] >= 1e-3 - 1e-9
 
 
@@ -213,7 +216,7 @@ def test_a_plate_that_lies_flat_has_a_contact_at_several_corners():
     scene = Scene(0)
     scene.monitor.put([shapes.box("floor", (0.0, 0.0, -1.0), (4.0, 4.0, 1.0))])
     poses = [(np.eye(3), np.array([0.0, 0.0, z])) for z in (3.0, 6.0, -0.4, 9.0)]
-    contacts = scene.monitor.near(scene.points(poses), by_fcl=True)
+    contacts = scene.near(scene.points(poses), by_fcl=True)
     rows = [k for k in range(len(contacts)) if contacts.pair(k) == (2, 0, False)]
     assert len(rows) == 3
     np.testing.assert_allclose(contacts.distance[rows], 0.06, atol=1e-6)
