@@ -61,6 +61,12 @@ class FclQueries:
         self.asked = self.refused = 0
         self._pieces, self._scale = pieces, _UNITS / unit
         self._hulls = [None if hull is None else _hull(hull, self._scale) for hull in bodies.hulls]
+        # Of each hull the mean of the corners of its simplex, m, and the inverse of its edges.
+        self._corners, self._inverse = np.zeros((len(bodies.hulls), 3)), np.zeros((len(bodies.hulls), 3, 3))
+        for k, hull in enumerate(bodies.hulls):
+            if hull is not None:
+                self._corners[k] = hull.simplex.mean(axis=0)
+                self._inverse[k] = np.linalg.inv((hull.simplex[1:] - hull.simplex[0]).T)
         self._objects: dict[int, Any] = {}
         self._body, self._other = _Axis(), _Axis()
         self._request = fcl.DistanceRequest(enable_nearest_points=True, enable_signed_distance=False)
@@ -99,9 +105,10 @@ class FclQueries:
         other, of_other : (K,) int, (K, 4, 3) or (K, 15)
             Other bodies and their points, or pieces and their numbers.
         """
-        bodies = map(self._placed, repeat(self._body), body, points)
+        bodies = map(self._placed, repeat(self._body), body, points, self._poses(body, points))
         if is_self:
-            return self._ask(bodies, map(self._placed, repeat(self._other), other, of_other))
+            poses = self._poses(other, of_other)
+            return self._ask(bodies, map(self._placed, repeat(self._other), other, of_other, poses))
         return self._ask(bodies, map(self._moved, other, of_other))
 
     def _ask(self, bodies: Iterable[fcl.CollisionObject], others: Iterable[fcl.CollisionObject]) -> Array:
@@ -117,17 +124,23 @@ class FclQueries:
         self.asked += len(found) // 7
         return np.array(found).reshape(-1, 7) / self._scale
 
-    def _placed(self, axis: _Axis, body: int, points: Array) -> fcl.CollisionObject:
-        """Return the object of a body at its `points` (4, 3), m: its hull, or `axis` for a capsule."""
-        hull = self._hulls[body]
-        if hull is None:
+    def _poses(self, bodies: Sequence[int], points: Array) -> list[Array]:
+        """Return for each body the rotation and the position (3, 4) of its hull for `points` (K, 4, 3), m."""
+        corners, inverse = self._corners[bodies, :, None], self._inverse[bodies]
+        edges = np.swapaxes(points[:, 1:] - points[:, :1], 1, 2)
+        # Between two states points go straight, so that their frame is a rotation only nearly.
+        u, _, v = np.linalg.svd(edges @ inverse)
+        turn = u @ v
+        position = self._scale * (points.mean(axis=1)[..., None] - turn @ corners)
+        return list(np.concatenate([turn, position], axis=2))
+
+    def _placed(self, axis: _Axis, body: int, points: Array, pose: Array) -> fcl.CollisionObject:
+        """Return the object of a body: its hull at `pose` (3, 4), or `axis` for a capsule at `points` (4, 3), m."""
+        known = self._hulls[body]
+        if known is None:
             first, second = self._scale * points[:2]
             return axis.placed(0.5 * (first + second), (second - first).tolist())
-        known, corners, inverse = hull
-        # Between two states points go straight, so that their frame is a rotation only nearly.
-        u, _, v = np.linalg.svd((points[1:] - points[0]).T @ inverse)
-        turn = u @ v
-        known.setTransform(fcl.Transform(turn, self._scale * (points.mean(axis=0) - turn @ corners)))
+        known.setTransform(fcl.Transform(pose[:, :3], pose[:, 3]))
         return known
 
     def _moved(self, piece: int, row: Array) -> fcl.CollisionObject:
@@ -152,13 +165,10 @@ class FclQueries:
         return known
 
 
-def _hull(hull: Hull, scale: float) -> tuple[fcl.CollisionObject, Array, Array]:
-    """Return a hull in FCL's units, the mean (3,) of the corners of its simplex, m, and the inverse of its edges."""
+def _hull(hull: Hull, scale: float) -> fcl.CollisionObject:
+    """Return a hull in FCL's units."""
     faces = np.insert(hull.faces, 0, 3, axis=1).ravel()
-    shape = fcl.Convex(scale * hull.vertices, len(hull.faces), faces)
-    corners = hull.simplex
-    edges = np.linalg.inv((corners[1:] - corners[0]).T)
-    return fcl.CollisionObject(shape, fcl.Transform()), corners.mean(axis=0), edges
+    return fcl.CollisionObject(fcl.Convex(scale * hull.vertices, len(hull.faces), faces), fcl.Transform())
 
 
 def _axes(first: Array, second: Array) -> tuple[list[Array], list[list[float]]]:

@@ -88,14 +88,17 @@ class HullGroup(Group):
         return found
 
     def distances(self, X: Array, time: float, rows: Index) -> Array:
-        """Return exact surface distances (k,) of some pairs, m; below zero where they overlap."""
+        """Return surface distances (k,) of some pairs, m; below zero where they overlap.
+
+        The least one is exact; others may be too small by the error of FCL's answers that are proven.
+        """
         pairs = self.at(X, time, rows)
-        sides, (x, y, normal, proven) = _Sides(self, pairs), self._witnesses(pairs)
-        # FCL's normals are exact to a millionth only.
-        for k in np.flatnonzero(proven).tolist():
-            x[k], y[k], normal[k] = self._computed(sides, k, normal[k])
-        low, high = sides.heights(normal)
-        return np.asarray(low.min(axis=1) - high - pairs[:, -2])
+        sides, (_, _, normal, proven) = _Sides(self, pairs), self._witnesses(pairs)
+        found = sides.gaps(normal) - pairs[:, -2]
+        nearest = found <= found.min(initial=np.inf) + 2.0 * PROOF * self.scene.unit
+        for k in np.flatnonzero(proven & nearest).tolist():
+            normal[k] = self._computed(sides, k, normal[k])[2]
+        return np.asarray(sides.gaps(normal) - pairs[:, -2])
 
     def contacts(self, X: Array, time: float, rows: Index, found: Array, by_fcl: bool) -> tuple[Index, Array]:  # noqa: ARG002
         """See ``Group.contacts``: they are FCL's already where these are proven."""
@@ -143,8 +146,7 @@ class HullGroup(Group):
             apart = np.linalg.norm(x - y, axis=1)
             with np.errstate(invalid="ignore", divide="ignore"):
                 normal = (x - y) / apart[:, None]
-                low, high = sides.heights(normal)
-                gap = low.min(axis=1) - high
+                gap = sides.gaps(normal)
                 # NaN fails the comparisons.
                 proven = (np.abs(answers[:, 0] - gap) + np.abs(apart - gap) <= PROOF * unit) & (
                     gap > NORMAL_FROM * unit
@@ -230,6 +232,11 @@ class _Sides:
             return low, np.einsum("kvc,kc->kv", self.others, normal).max(axis=1)
         furthest = self._scene.batch(support_function, self._shape)(self._pieces, normal)
         return low, np.einsum("kc,kc->k", furthest, normal)
+
+    def gaps(self, normal: Array) -> Array:
+        """Return the gaps (k,) between the supporting planes of both sides along normals (k, 3), m."""
+        low, high = self.heights(normal)
+        return np.asarray(low.min(axis=1) - high)
 
     def weights_of(self, x: Array) -> Array:
         """Return (k, 4) the weights of the bodies' points in points `x` (k, 3) of these."""

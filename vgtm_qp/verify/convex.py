@@ -24,7 +24,11 @@ _EXACT = 1e-13
 """Gap between upper and lower bound of a distance that ends the search, over the size of what is far from what."""
 _TOUCHING = 1e-12
 """Distance, over the same size, below which two bodies overlap."""
-_SUBSETS = [list(s) for count in (1, 2, 3) for s in itertools.combinations(range(3), count)]
+_OTHERS = ((1, 2), (0, 2), (0, 1))
+_SUBSETS: NDArray[np.bool_] = np.array(
+    [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 1, 1], [1, 0, 1], [1, 1, 0], [1, 1, 1]], dtype=np.bool_
+)
+"""Subsets of three corners besides a fourth."""
 _WAYS: Array = np.array([way for way in itertools.product((-1.0, 0.0, 1.0), repeat=3) if any(way)])
 """Directions in which the depth of overlapping bodies is measured."""
 
@@ -101,25 +105,36 @@ def _nearest(new: Array, corners: Array, used: NDArray[np.bool_]) -> tuple[Array
     """Return weights (P, 4) and place (P, 3) of the point nearest to the origin in simplices.
 
     Its corners are `new` (P, 3), which has a share in that point, and those `used` (P, 3) of `corners` (P, 3, 3). For
-    each subset of these the point nearest in its plane counts if it is within the subset.
+    each subset of these the point nearest in its plane counts if it is within the subset: new + sum of share . edge,
+    with shares by Cramer's rule.
     """
     edges = corners - new[:, None]
     gram, right = np.einsum("pkc,plc->pkl", edges, edges), -np.einsum("pkc,pc->pk", edges, new)
-    best, place = np.zeros((len(new), 4)), new.copy()
-    best[:, 0] = 1.0
-    least = np.einsum("pc,pc->p", new, new)
-    for subset in _SUBSETS:
-        share, whole = _solved(gram[:, subset][:, :, subset], right[:, subset])
-        valid = used[:, subset].all(axis=1) & (whole > 0.0)
-        share = share / np.where(valid, whole, 1.0)[:, None]
-        rest = 1.0 - share.sum(axis=1)
-        point = new + np.einsum("pk,pkc->pc", share, edges[:, subset])
-        square = np.einsum("pc,pc->p", point, point)
-        better = valid & (share > 0.0).all(axis=1) & (rest > 0.0) & (square < least)
-        weights = np.zeros((len(new), 4))
-        weights[:, 0], weights[:, [k + 1 for k in subset]] = rest, share
-        least[better], best[better], place[better] = square[better], weights[better], point[better]
-    return best, place
+    square = np.einsum("pkk->pk", gram)
+    shares, whole = np.zeros((len(new), 8, 3)), np.ones((len(new), 8))
+    for k in range(3):
+        shares[:, 1 + k, k], whole[:, 1 + k] = right[:, k], square[:, k]
+        i, j = _OTHERS[k]
+        product = gram[:, i, j]
+        shares[:, 4 + k, i] = right[:, i] * square[:, j] - right[:, j] * product
+        shares[:, 4 + k, j] = right[:, j] * square[:, i] - right[:, i] * product
+        whole[:, 4 + k] = square[:, i] * square[:, j] - product * product
+    a, d, f = square.T
+    b, c, e = gram[:, 0, 1], gram[:, 0, 2], gram[:, 1, 2]
+    cofactors = np.array(
+        [[d * f - e * e, c * e - b * f, b * e - c * d], [c * e - b * f, a * f - c * c, b * c - a * e]]
+    )
+    last = np.array([cofactors[0, 2], cofactors[1, 2], a * d - b * b])
+    adjugate = np.concatenate([cofactors, last[None]])
+    shares[:, 7] = np.einsum("klp,pl->pk", adjugate, right)
+    whole[:, 7] = a * adjugate[0, 0] + b * adjugate[0, 1] + c * adjugate[0, 2]
+    fits = (used[:, None, :] | ~_SUBSETS).all(axis=2) & (whole > 0.0)
+    shares /= np.where(fits, whole, 1.0)[..., None]
+    fits &= ((shares > 0.0) | ~_SUBSETS).all(axis=2) & (shares.sum(axis=2) < 1.0)
+    chosen = np.where(fits, -np.einsum("psk,pk->ps", shares, right), np.inf).argmin(axis=1)
+    share = shares[np.arange(len(new)), chosen]
+    weights = np.concatenate([1.0 - share.sum(axis=1, keepdims=True), share], axis=1)
+    return weights, new + np.einsum("pk,pkc->pc", share, edges)
 
 
 def _normals(new: Array, corners: Array) -> Iterator[Array]:
@@ -131,16 +146,3 @@ def _normals(new: Array, corners: Array) -> Iterator[Array]:
         yield np.cross(np.cross(edge, new), edge)
         normal = np.cross(edges[:, k - 1], edge)
         yield normal * np.sign(np.einsum("pc,pc->p", normal, new))[:, None]
-
-
-def _solved(gram: Array, right: Array) -> tuple[Array, Array]:
-    """Return x (P, k) and d (P,) for which `gram` x = d `right`, by Cramer's rule, for up to three unknowns."""
-    if gram.shape[1] == 1:
-        return right, gram[:, 0, 0]
-    if gram.shape[1] == 2:
-        (a, b), (_, d), (r, s) = gram[:, 0].T, gram[:, 1].T, right.T
-        return np.stack([r * d - s * b, s * a - r * b], axis=1), a * d - b * b
-    columns = np.moveaxis(gram, 2, 0)
-    across = [np.cross(columns[k - 2], columns[k - 1]) for k in range(3)]
-    whole = np.einsum("pc,pc->p", columns[0], across[0])
-    return np.stack([np.einsum("pc,pc->p", right, one) for one in across], axis=1), whole
