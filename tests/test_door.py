@@ -800,7 +800,7 @@ def test_bodies_of_another_problem_are_found(change, said):
 @pytest.mark.parametrize("prismatic", [False, True])
 def test_long_chains_loop_over_their_joints_and_give_the_same(monkeypatch, prismatic, rng):
     spec = serial_problem(chain(12, prismatic=prismatic)).arm
-    looped, written_out = SerialChain.of(spec), SerialChain.of(spec)
+    looped, written_out = SerialChain.of(spec, []), SerialChain.of(spec, [])
     monkeypatch.setattr(serial_chain, "UNROLLED", 0)
     assert looped.functions[1].is_a("MXFunction")
     monkeypatch.setattr(serial_chain, "UNROLLED", 100)

@@ -279,7 +279,7 @@ def test_capsules_hold_the_points_they_are_made_for(points, stretch):
 )
 def test_a_capsule_round_a_cylinder_holds_its_rims_and_little_more(shape, folder):
     (folder / "arm.urdf").write_text(ARM.replace('<cylinder radius="0.05" length="0.4"/>', shape))
-    body = read_urdf(folder / "arm.urdf", tip_link="tool").bodies[1]
+    body = read_urdf(folder / "arm.urdf", tip_link="tool", bodies="capsule").bodies[1]
     r, length = (float(x) for x in re.findall(r'"([\d.]+)"', shape))
     angle = np.linspace(0.0, 2.0 * np.pi, 400)
     rim = np.stack([r * np.cos(angle), r * np.sin(angle), np.zeros_like(angle)], axis=1)
@@ -290,6 +290,26 @@ def test_a_capsule_round_a_cylinder_holds_its_rims_and_little_more(shape, folder
         assert np.linalg.norm(points - nearest, axis=1).max() <= body.radius
     capsule = np.pi * body.radius**2 * (np.ptp(body.points[:, 2]) + 4.0 / 3.0 * body.radius)
     assert capsule < 1.9 * np.pi * r * r * length
+
+
+def test_what_stands_for_a_shape_is_chosen(folder):
+    cylinder = '<cylinder radius="0.05" length="0.4"/>'
+    hull, primitives = (
+        read_urdf(folder / "arm.urdf", tip_link="tool", bodies=kind).bodies for kind in ("hull", "primitives")
+    )
+    assert [body.points.tolist() for body in hull] == [body.points.tolist() for body in primitives]
+    prism = hull[1].points - [0.0, 0.0, 0.2]
+    aside = np.linalg.norm(prism[:, :2], axis=1)
+    assert (aside > 0.05).all()
+    assert (aside < 0.05 * 1.01).all()
+    assert np.ptp(prism[:, 2]) == pytest.approx(0.4)
+    # The prism holds the cylinder: the middles of its sides are on it.
+    rim = np.array([x for x in prism if x[2] < 0.0])[:, :2]
+    assert np.linalg.norm(rim + np.roll(rim, 1, axis=0), axis=1) / 2.0 == pytest.approx(0.05)
+    assert (hull[2].points.tolist(), hull[2].radius) == ([[0.0, 0.0, 0.0]], 0.08)
+    (folder / "arm.urdf").write_text(ARM.replace(cylinder, '<mesh filename="wedge.stl"/>'))
+    with pytest.raises(vq.ProblemError, match="takes no meshes"):
+        read_urdf(folder / "arm.urdf", tip_link="tool", bodies="primitives")
 
 
 @pytest.mark.parametrize(
@@ -309,10 +329,13 @@ def test_meshes_are_found_and_enclosed(name, place, folder):
     source.rename(target)
     mesh = f'<mesh filename="{name}" scale="2 1 1"/>'
     (folder / "arm.urdf").write_text(ARM.replace('<sphere radius="0.08"/>', mesh))
-    arm = read_urdf(folder / "arm.urdf", tip_link="tool", package_path=[folder / "packages"])
-    body = next(body for body in arm.bodies if body.name == "arm")
-    assert arm.files == (folder / "arm.urdf", target)
+    of = {"tip_link": "tool", "package_path": [folder / "packages"]}
+    arm, hulls = (read_urdf(folder / "arm.urdf", **of, bodies=kind) for kind in ("capsule", "hull"))
+    body, hull = (next(body for body in bodies if body.name == "arm") for bodies in (arm.bodies, hulls.bodies))
+    assert arm.files == hulls.files == (folder / "arm.urdf", target)
     corners = np.array(np.meshgrid(*[(-1, 1)] * 3)).reshape(3, -1).T * [0.1, 0.1, 0.15]
+    np.testing.assert_allclose(np.sort(hull.points, axis=0), np.sort(corners, axis=0), atol=1e-7)
+    assert hull.radius == 0.0
     along = body.points[1] - body.points[0]
     share = np.clip((corners - body.points[0]) @ along / (along @ along), 0.0, 1.0)
     assert np.linalg.norm(corners - body.points[0] - share[:, None] * along, axis=1).max() <= body.radius
@@ -365,7 +388,7 @@ def test_a_result_is_held_against_the_urdf_of_another_problem(folder):
         ('urdf = "amr.urdf"', "arm.urdf", 'did you mean "arm.urdf"'),
         ("urdf = 3", "arm.urdf", ""),
         ('urdf = "arm.urdf"\njoint = []', "arm.joint", "no such key beside urdf"),
-        ('urdf = "arm.urdf"\nbodies = "hull"', "arm.bodies", "capsule"),
+        ('urdf = "arm.urdf"\nbodies = "mesh"', "arm.bodies", "capsule"),
         ('urdf = "arm.urdf"\nbase_link = 3', "arm.base_link", "a name"),
     ],
 )
@@ -470,7 +493,7 @@ def test_collada_is_read_in_its_unit(unit, folder):
     pytest.importorskip("collada")
     (folder / "part.dae").write_text(COLLADA.format(unit=unit, more=""))
     (folder / "arm.urdf").write_text(ARM.replace('<sphere radius="0.08"/>', '<mesh filename="part.dae"/>'))
-    body = read_urdf(folder / "arm.urdf", tip_link="tool").bodies[2]
+    body = read_urdf(folder / "arm.urdf", tip_link="tool", bodies="capsule").bodies[2]
     corners = unit * np.vstack([np.zeros(3), np.eye(3)])
     along = body.points[-1] - body.points[0]
     share = np.clip((corners - body.points[0]) @ along / max(along @ along, 1e-300), 0.0, 1.0)
