@@ -331,7 +331,9 @@ def test_meshes_are_found_and_enclosed(name, place, folder):
     (folder / "arm.urdf").write_text(ARM.replace('<sphere radius="0.08"/>', mesh))
     of = {"tip_link": "tool", "package_path": [folder / "packages"]}
     arm, hulls = (read_urdf(folder / "arm.urdf", **of, bodies=kind) for kind in ("capsule", "hull"))
-    body, hull = (next(body for body in bodies if body.name == "arm") for bodies in (arm.bodies, hulls.bodies))
+    body, hull = (
+        next(body for body in bodies if body.name == "arm") for bodies in (arm.bodies, hulls.bodies)
+    )
     assert arm.files == hulls.files == (folder / "arm.urdf", target)
     corners = np.array(np.meshgrid(*[(-1, 1)] * 3)).reshape(3, -1).T * [0.1, 0.1, 0.15]
     np.testing.assert_allclose(np.sort(hull.points, axis=0), np.sort(corners, axis=0), atol=1e-7)
