@@ -129,9 +129,9 @@ class Bisection:
     def run(self, decision: Decision) -> None:
         """Halve intervals until each is decided, and add the results to `decision`."""
         pair = np.arange(len(self.segment))
-        edges = [self._edge(pair, np.full(len(pair), share)) for share in (0.0, 1.0)]
         start, width = np.zeros(len(pair)), 1.0
-        first, last = edges
+        first = self._edge(pair, np.zeros(len(pair)))
+        last = self._edge(pair, np.ones(len(pair)), first.normal)
         proven = self._across(pair, first, last)
         for depth in range(GREATEST_DEPTH + 1):
             proven = np.maximum(proven - self.bend[pair] * width**2 / 8.0, -self.depth[pair])
@@ -143,7 +143,7 @@ class Bisection:
             rows = np.flatnonzero(open_)
             pair, start, first, last = pair[rows], start[rows], first.at(rows), last.at(rows)
             width /= 2.0
-            middle = self._edge(pair, start + width)
+            middle = self._edge(pair, start + width, first.normal)
             first, last = _Edge.interleaved(first, middle), _Edge.interleaved(middle, last)
             start = np.stack([start, start + width], axis=1).reshape(-1)
             pair = np.repeat(pair, 2)
@@ -185,21 +185,26 @@ class Bisection:
         held = np.minimum(np.stack([first.held, last.held], axis=1), others.reshape(-1, 2))
         return np.asarray(held.max(axis=1))
 
-    def _edge(self, pair: Index, share: Array) -> _Edge:
-        """Return pairs (P,) at shares (P,) of their segments, and record the least distances so far."""
+    def _edge(self, pair: Index, share: Array, near: Array | None = None) -> _Edge:
+        """Return pairs (P,) at shares (P,) of their segments, and record the least distances so far.
+
+        Their normals are searched `near` (P, 3) those.
+        """
         x = self.segment[pair] + share
         instants, which = np.unique(x, return_inverse=True)
         if len(instants) > 1 and len(instants) * len(self.motion.arm.radius) > _CHUNK:
             half = len(pair) // 2
+            halves = (slice(half), slice(half, None))
             return _Edge.joined(
-                [self._edge(pair[:half], share[:half]), self._edge(pair[half:], share[half:])]
+                [self._edge(pair[k], share[k], None if near is None else near[k]) for k in halves]
             )
         segment = np.minimum(instants.astype(np.int64), len(self.motion.time) - 2)
         ends = self.motion.ends_at(segment, instants - segment)
         time = self.motion.times_at(segment, instants - segment)
         parts = [_Edge.none(2 * ends.shape[2])]
         for own, rows in self._groups(pair):
-            parts.append(_edge_of(own, self._pair(pair[rows]), ends, time, which[rows]))
+            hint = None if near is None else near[rows]
+            parts.append(_edge_of(own, self._pair(pair[rows]), ends, time, which[rows], hint))
         edge = _Edge.joined(parts)
         self._keep(pair, edge.distance, time[which])
         return edge
@@ -287,8 +292,10 @@ class Bisection:
                 yield names, run
 
 
-def _edge_of(own: Kept, pair: Pairs, ends: Array, time: Array, which: Index) -> _Edge:
+def _edge_of(
+    own: Kept, pair: Pairs, ends: Array, time: Array, which: Index, near: Array | None = None
+) -> _Edge:
     """Return pairs (P,), each at the instant `which` (P,) of `ends` (U, B, 2, 3), m, and `time` (U,), s."""
     points = own.points(pair, lambda member: ends[which, member], time[which])
-    distance, normal = own.separation(points, pair)
+    distance, normal = own.separation(points, pair, near)
     return _Edge(points, distance, normal, own.apart(points, normal, pair))

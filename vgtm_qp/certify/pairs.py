@@ -11,6 +11,7 @@ import numpy as np
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.certify.motion import GivenMotion
 from vgtm_qp.verify.clearance import AgainstMembers, Pairs, box_gap
+from vgtm_qp.verify.convex import of_each
 from vgtm_qp.verify.distance import Separation
 from vgtm_qp.verify.obstacles import Body
 
@@ -61,8 +62,8 @@ class Kept(ABC):
         """
 
     @abstractmethod
-    def separation(self, points: Array, pair: Pairs) -> Separation:
-        """Return distances from surface to surface (P,), m, and normals (P, 3)."""
+    def separation(self, points: Array, pair: Pairs, near: Array | None = None) -> Separation:
+        """Return distances from surface to surface (P,), m, and normals (P, 3), those of hulls searched `near` some."""
 
     @abstractmethod
     def apart(self, points: Array, normal: Array, pair: Pairs) -> Array:
@@ -186,14 +187,16 @@ class KeptBodies(Kept):
         own = np.einsum("pec,pcd->ped", ends(pair[0]) - center[:, None], self._rotation[pair[1]])
         return np.concatenate([own, own], axis=1)
 
-    def separation(self, points: Array, pair: Pairs) -> Separation:
+    def separation(self, points: Array, pair: Pairs, near: Array | None = None) -> Separation:
         """See ``Kept``; normals are in the pieces' own frames."""
         shape, sizes = self._shape, self._sizes[pair[1]]
-        distance, normal = shape.distance(points[:, 0], points[:, 1], sizes)
-        hull = self.motion.arm.is_hull[pair[0]]
-        if hull.any():
-            vertices = points[hull, : points.shape[1] // 2]
-            distance[hull], normal[hull] = shape.hull_distance(vertices, sizes[hull])
+        distance, normal = of_each(
+            self.motion.arm.is_hull[pair[0]],
+            lambda k: shape.distance(points[k, 0], points[k, 1], sizes[k]),
+            lambda k: shape.hull_distance(
+                points[k, : points.shape[1] // 2], sizes[k], None if near is None else near[k]
+            ),
+        )
         return distance - self.motion.arm.radius[pair[0]], normal
 
     def apart(self, points: Array, normal: Array, pair: Pairs) -> Array:
@@ -248,9 +251,9 @@ class KeptMembers(Kept):
         """See ``Kept``: the ends of both."""
         return self._against.points(pair, ends, time)
 
-    def separation(self, points: Array, pair: Pairs) -> Separation:
+    def separation(self, points: Array, pair: Pairs, near: Array | None = None) -> Separation:
         """See ``Kept``."""
-        return self._against.separation(points, pair)
+        return self._against.separation(points, pair, near)
 
     def apart(self, points: Array, normal: Array, pair: Pairs) -> Array:
         """See ``Kept``."""

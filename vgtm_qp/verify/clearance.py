@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.verify.arm import Arm
 from vgtm_qp.verify.carrying import CarryingArm
-from vgtm_qp.verify.convex import hull_distance
+from vgtm_qp.verify.convex import hull_distance, of_each
 from vgtm_qp.verify.distance import Separation, segment_segment
 from vgtm_qp.verify.obstacles import Body
 
@@ -111,8 +111,11 @@ class Encounters(ABC):
         """
 
     @abstractmethod
-    def separation(self, points: Array, pair: Pairs) -> Separation:
-        """Return the exact surface distance (P,), m, and the normal (P, 3) at those points."""
+    def separation(self, points: Array, pair: Pairs, near: Array | None = None) -> Separation:
+        """Return the exact surface distance (P,), m, and the normal (P, 3) at those points.
+
+        The search for those of hulls begins `near` (P, 3) the normals, if given.
+        """
 
     @abstractmethod
     def apart(self, points: Array, normal: Array, pair: Pairs) -> Array:
@@ -197,13 +200,14 @@ class Encounters(ABC):
     def divide(self, step: int, pair: Pairs, limit: Least, bound: Least) -> tuple[Least, Least]:
         """Return `limit` and `bound` lowered by pairs (P,), (P,) in the motion from state `step` to the next."""
         start, width = np.zeros(len(pair[0])), 1.0
-        bend = self._bend(step, pair)
+        bend, near = self._bend(step, pair), None
         for depth in range(_GREATEST_DEPTH):
             shares = (start, np.minimum(start + width, 1.0))
             edges = [self._points_between(step, pair, share) for share in shares]
-            proven = np.full(len(start), -np.inf)
+            proven, normals = np.full(len(start), -np.inf), []
             for points, share in zip(edges, shares, strict=True):
-                distance, normal = self.separation(points, pair)
+                distance, normal = self.separation(points, pair, near)
+                normals.append(normal)
                 limit = limit.or_lower(distance, self._called_between(step, share, pair))
                 held = np.minimum(*(self.apart(ends, normal, pair) for ends in edges))
                 proven = np.maximum(proven, np.maximum(held - bend * width**2 / 8.0, self._floor(pair)))
@@ -217,7 +221,7 @@ class Encounters(ABC):
             width /= 2.0
             start = np.concatenate([start[open_], start[open_] + width])
             pair = (np.tile(pair[0][open_], 2), np.tile(pair[1][open_], 2))
-            bend = np.tile(bend[open_], 2)
+            bend, near = np.tile(bend[open_], 2), np.concatenate([normal[open_] for normal in normals])
         return limit, bound
 
     def _points_between(self, step: int, pair: Pairs, share: Array) -> Array:
@@ -276,12 +280,13 @@ class AgainstBody(Encounters):
         """Return (P, V, 3) the ends of the members, seen from the centre of the body."""
         return np.asarray(ends(pair[0]) - self.body.at(time)[:, None])
 
-    def separation(self, points: Array, pair: Pairs) -> Separation:
+    def separation(self, points: Array, pair: Pairs, near: Array | None = None) -> Separation:
         """Return surface distances and normals."""
-        distance, normal = self.body.separation(points[:, 0], points[:, 1], pair[1])
-        hull = self.with_hull(pair)
-        if hull.any():
-            distance[hull], normal[hull] = self.body.hull_separation(points[hull], pair[1][hull])
+        distance, normal = of_each(
+            self.with_hull(pair),
+            lambda k: self.body.separation(points[k, 0], points[k, 1], pair[1][k]),
+            lambda k: self.body.hull_separation(points[k], pair[1][k], None if near is None else near[k]),
+        )
         return distance - self.motion.arm.radius[pair[0]], normal
 
     def apart(self, points: Array, normal: Array, pair: Pairs) -> Array:
@@ -348,9 +353,9 @@ class AgainstMembers(Encounters):
         """Return (P, 2 V, 3) the ends of both members."""
         return np.concatenate([ends(member) for member in pair], axis=1)
 
-    def separation(self, points: Array, pair: Pairs) -> Separation:
+    def separation(self, points: Array, pair: Pairs, near: Array | None = None) -> Separation:
         """Return surface distances and normals."""
-        distance, normal = body_distance(points, self.with_hull(pair))
+        distance, normal = body_distance(points, self.with_hull(pair), near)
         return distance - self.radii(pair), normal
 
     def apart(self, points: Array, normal: Array, pair: Pairs) -> Array:
@@ -385,22 +390,25 @@ def apart_at_home(arm: Arm, resolution: float) -> list[str]:
     return [f"{names[a]} / {names[b]} do not touch at home" for a, b in arm.touching[apart].tolist()]
 
 
-def body_distance(points: Array, hull: NDArray[np.bool_]) -> Separation:
+def body_distance(points: Array, hull: NDArray[np.bool_], near: Array | None = None) -> Separation:
     """Return distances (P,), m, and normals (P, 3) between two bodies of the arm each, without their radii.
 
-    `points` (P, 2 V, 3) are the ends or vertices of both; `hull` (P,) says where at least one of them is a hull.
+    `points` (P, 2 V, 3) are the ends or vertices of both; `hull` (P,) says where at least one of them is a hull,
+    and `near` (P, 3) where the normals of these are searched first, if known.
     """
     count = points.shape[1] // 2
-    distance, normal = segment_segment(*(points[:, k] for k in (0, 1, count, count + 1)))
-    if hull.any():
-        others = points[hull, count:]
+
+    def hulls(own: Index) -> Separation:
+        others = points[own, count:]
 
         def furthest(direction: Array, rows: Index) -> Array:
             corner = np.einsum("pvc,pc->pv", others[rows], direction).argmax(axis=1)
             return np.asarray(others[rows, corner])
 
-        distance[hull], normal[hull] = hull_distance(points[hull, :count], furthest)
-    return distance, normal
+        return hull_distance(points[own, :count], furthest, None if near is None else near[own])
+
+    ends = (0, 1, count, count + 1)
+    return of_each(hull, lambda own: segment_segment(*(points[own, k] for k in ends)), hulls)
 
 
 def box_gap(low: Array, high: Array, other_low: Array, other_high: Array) -> Array:

@@ -33,16 +33,35 @@ _WAYS: Array = np.array([way for way in itertools.product((-1.0, 0.0, 1.0), repe
 """Directions in which the depth of overlapping bodies is measured."""
 
 
-def hull_distance(vertices: Array, furthest: Furthest) -> Separation:
+def of_each(
+    hull: NDArray[np.bool_], axes: Callable[[Index], Separation], hulls: Callable[[Index], Separation]
+) -> Separation:
+    """Return distances (P,) and normals (P, 3): `hulls` of the rows that have a `hull` (P,), `axes` of the others."""
+    rows = np.flatnonzero(~hull)
+    if len(rows) == len(hull):
+        return axes(rows)
+    distance, normal = np.empty(len(hull)), np.empty((len(hull), 3))
+    if len(rows):
+        distance[rows], normal[rows] = axes(rows)
+    rows = np.flatnonzero(hull)
+    distance[rows], normal[rows] = hulls(rows)
+    return distance, normal
+
+
+def hull_distance(vertices: Array, furthest: Furthest, near: Array | None = None) -> Separation:
     """Return the distances (P,), m, of hulls with `vertices` (P, V, 3) from other bodies, and normals (P, 3).
 
+    The search is short where it begins `near` (P, 3) the normals; zero where these are unknown.
     Where they overlap, the distance is minus a bound of the least translation that parts them, and the normal its way.
     """
     count = len(vertices)
     every = np.arange(count)
     lower, best = np.full(count, -np.inf), np.zeros((count, 3))
     overlap = np.zeros(count, dtype=np.bool_)
-    direction = vertices.mean(axis=1) - furthest(np.tile([0.0, 0.0, 1.0], (count, 1)), every)
+    direction = np.zeros((count, 3)) if near is None else near.copy()
+    unknown = np.flatnonzero(~direction.any(axis=1))
+    upwards = np.tile([0.0, 0.0, 1.0], (len(unknown), 1))
+    direction[unknown] = vertices[unknown].mean(axis=1) - furthest(upwards, unknown)
     length = np.linalg.norm(direction, axis=1)
     normal = np.where(length[:, None] > 0.0, direction / np.maximum(length, 1e-300)[:, None], [0.0, 0.0, 1.0])
     rows, upper = every, np.full(count, np.inf)
