@@ -287,7 +287,7 @@ def make_engine(
     if tracking in ("recursive", "parallel"):
         by_bays = BaySolver(layout, parallel=tracking == "parallel")
         return GeneralEngine(layout, kinematics, task, by_bays, compiled=compiled)
-    is_short = len(layout.arm.actuators) < STAGED_ACTUATORS
+    is_short = _is_short(layout)
     if layout.elastic_tip and not is_short:
         _LOG.warning(_CONDENSED_ALL_THE_SAME)
     is_quick = not plain and not layout.elastic_tip and not layout.own
@@ -309,10 +309,15 @@ def elastic_engine(
 ) -> Callable[[], Engine]:
     """Return a function that gives the engine for ``Layout.giving_way``; the first call builds it."""
     # The engine of a long arm is seldom needed, and built faster without compiling.
-    is_short = len(layout.arm.actuators) < STAGED_ACTUATORS
+    is_short = _is_short(layout)
     return cache(
         lambda: make_engine(solver, layout.giving_way(), kinematics, task, compiled=is_short, plain=plain)
     )
+
+
+def _is_short(layout: Layout) -> bool:
+    """Whether condensing onto the actuators is fastest: there are few, or no bays to eliminate one after another."""
+    return len(layout.arm.actuators) < STAGED_ACTUATORS or layout.arm.bays is None
 
 
 def check_solver(problem: Problem) -> None:

@@ -12,8 +12,10 @@ import numpy as np
 from vgtm_qp.arm.arm import Approach, Stations, Tip, has_full_rank
 from vgtm_qp.arm.frames import frames_along
 from vgtm_qp.arm.joint_space import Follower, JointSpaceArm
+from vgtm_qp.arm.serial.bend import bend_function
 from vgtm_qp.arm.serial.chain import SerialChain, hull_of, vertices_of
 from vgtm_qp.arrays import Array, Index, Mask
+from vgtm_qp.compiled import Kernel
 from vgtm_qp.geometry.bodies import Bodies, Hull, capsules, convex_bodies
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.problem.arm import ArmBody, ArmTable, Joint
@@ -143,6 +145,18 @@ class SerialArm(JointSpaceArm):
         to_places, bounds = self._ways[0], np.full(int(self.base.sum()), np.inf)
         bounds[:2] = to_places[-1], to_places[-1] - to_places[0]
         return bounds
+
+    def tip_deviation(self, start: Array, end: Array, reach: float) -> float:
+        """See ``arm.Arm``: an eighth of a bound of a point's second derivative, at least that for all nodes."""
+        bend = self._bend
+        bend.inputs[0][:], bend.inputs[1][:] = start, end
+        bend()
+        nodes, tip, beyond = bend.outputs[0]
+        return float(max(nodes, tip + beyond * reach)) / 8.0
+
+    @cached_property
+    def _bend(self) -> Kernel:
+        return bend_function(self.chain).kernel()
 
     def approach(self, motion: Array) -> Approach:
         """See ``arm.Arm``.
