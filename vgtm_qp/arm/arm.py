@@ -468,6 +468,20 @@ class Kinematics:
             kernel.bind_output(k, self._kernel.outputs[k])
         return kernel
 
+    @cached_property
+    def _tip_alone(self) -> Kernel:
+        kernel = tip_function(self._arm).kernel(compiled=self._compiled)
+        for k in range(2):
+            kernel.bind_output(k, self._kernel.outputs[2 + k])
+        return kernel
+
+    def evaluate_tip(self, X: Array) -> None:
+        """Overwrite rotation and spin of the tip alone, for nodes at `X` (N, 3), m."""
+        tip = self._arm.end_effector
+        if tip.has_frame:
+            self._tip_alone.inputs[0][:] = X[tip.nodes].reshape(-1)
+            self._tip_alone()
+
     def evaluate_quantities(self, q: Array) -> None:
         """Overwrite quantities, gradient and tip alone, at a quarter of the cost for a long arm."""
         kernel = self._kernel if len(self._arm.stations) <= _FEW_STATIONS else self._without_stations
@@ -477,6 +491,14 @@ class Kinematics:
     def motion(self) -> MotionRows:
         """Return how the nodes move at the configuration evaluated last."""
         return self._arm.motion_rows(self._motion.copy(), np.zeros(3 * len(self._arm.free)))
+
+
+def tip_function(arm: Arm) -> Bound:
+    """Return the function from the tip's nodes (3, K) to its rotation (3, 3) and spin (3, 3K); the tip has a frame."""
+    constants, tip = Constants(), arm.end_effector
+    nodes, own = ca.MX.sym("nodes", 3, len(tip.nodes)), np.arange(len(tip.nodes))[None]
+    frame = Frames(arm.home[tip.nodes][None], tip.frame[None], own, constants, "tip")
+    return constants.bound("tip_frame", [nodes], list(frame.at(nodes)))
 
 
 def between(start: Array, end: Array, pieces: int) -> Array:

@@ -6,11 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import casadi as ca
 import numpy as np
 
-from vgtm_qp.arm.arm import Approach, Arm, between
-from vgtm_qp.arm.symbols import Constants, Frames
+from vgtm_qp.arm.arm import Approach, Arm, between, tip_function
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.geometry.shapes import Obstacle
 from vgtm_qp.problem.enclosing import box_capsules, capsule_along, enclosing_capsule
@@ -173,11 +171,7 @@ class _TipFrame:
     """The end effector's frame, by its nodes alone."""
 
     def __init__(self, arm: Arm) -> None:
-        self._tip = tip = arm.end_effector
-        constants, nodes = Constants(), ca.MX.sym("nodes", 3, len(tip.nodes))
-        own = np.arange(len(tip.nodes))[None]
-        frame = Frames(arm.home[tip.nodes][None], tip.frame[None], own, constants, "tip")
-        self._kernel = constants.bound("tip_frame", [nodes], list(frame.at(nodes))).kernel(compiled=False)
+        self._tip, self._kernel = arm.end_effector, tip_function(arm).kernel(compiled=False)
 
     def at(self, X: Array) -> tuple[Array, Array, Array]:
         """Return position (3,), m, rotation (3, 3) and spin (3, 3K) for nodes at `X` (N, 3), m."""

@@ -20,6 +20,10 @@ from vgtm_qp.compiled import Compiling, Kernel
 from vgtm_qp.rotation import vector_near
 
 
+_KNOWN = 4
+"""Number of configurations whose nodes are kept."""
+
+
 class Follower(NamedTuple):
     """A joint whose value is `multiplier` times another joint's value, plus a constant: a fixed quantity."""
 
@@ -123,7 +127,14 @@ class JointSpaceArm(Arm):
         return JacobianRows(response.reshape(len(self.actuators), len(rhs)).T, rhs)
 
     def nodes(self, q: Array) -> Array:
-        return np.asarray(self._nodes(q[None])[0])
+        """See ``arm.Arm``; read-only. A step asks for those of its first and last configuration several times."""
+        key, known = q.tobytes(), self._known_nodes
+        if key not in known:
+            if len(known) == _KNOWN:
+                del known[next(iter(known))]
+            known[key] = self._nodes(q[None])[0]
+            known[key].setflags(write=False)
+        return known[key]
 
     def ways(self, start: Array, end: Array, pieces: int) -> Array:
         return self._nodes(between(start, end, pieces))
@@ -137,6 +148,11 @@ class JointSpaceArm(Arm):
         kernel.inputs[0][:] = states.reshape(-1)
         kernel()
         return kernel.outputs[0].reshape(count, -1, 3).copy()
+
+    @cached_property
+    def _known_nodes(self) -> dict[bytes, Array]:
+        """The nodes of the last configurations."""
+        return {}
 
     @cached_property
     def _placing(self) -> tuple[Bound, Compiling]:
@@ -189,8 +205,15 @@ class JointSpaceArm(Arm):
         return self.advanced(np.zeros(len(q)), q, np.maximum(upper - at, at - lower))
 
     def travel(self, motion: Array) -> float:
-        turn, slide = self._motions(motion)
-        return float(turn @ self.reaches + slide.sum() + np.abs(motion[-6:-3]).max(initial=0.0))
+        joints, base = np.abs(motion[:-6]) @ self._levers, motion[-6:]
+        if base.any():
+            joints += 2.0 * float(np.linalg.norm(base[3:])) * self.reaches[0] + np.abs(base[:3]).max()
+        return float(joints)
+
+    @cached_property
+    def _levers(self) -> Array:
+        """(J,) bounds of how far a node moves per change of each joint: a reach in m, or 1."""
+        return np.where(self.revolute, self.reaches[1:], 1.0)
 
     def deviation(self, start: Array, end: Array) -> float:
         return 2.0 * self.tip_deviation(start, end, 0.0)

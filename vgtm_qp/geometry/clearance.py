@@ -229,6 +229,8 @@ class Clearance:
             For obstacles and, if it differs, between bodies, m.
         """
         self_floor = floor if self_floor is None else self_floor
+        if self.is_watched and self._watching is not None and self._watching.keeps(X, floor, self_floor):
+            return True
         motion = self._candidates.cover(X, time, max(floor, 0.0), max(self_floor, 0.0))
         for group in self._candidates.groups:
             least = self_floor if group.is_self else floor

@@ -94,6 +94,7 @@ class _WatchedGroup:
         self.group = group
         piece = np.zeros((count, WIDTH)) if group.is_self else group.scene.pieces.parameters[group.other]
         normal = np.tile([0.0, 0.0, 1.0], (count, 1))
+        self._lower = group.distance.copy()
         self._rows, self._contacts = np.zeros(count, dtype=np.int64), np.zeros((2 * count, CONTACT))
         self._program.set(
             count=count,
@@ -103,7 +104,7 @@ class _WatchedGroup:
             body=group.body.astype(np.int32),
             other=group.other.astype(np.int32),
             points=np.ascontiguousarray(group.points, dtype=np.int32),
-            lower=group.distance.copy(),
+            lower=self._lower,
             known=np.concatenate([piece, group.radius[:, None], normal], axis=1),
             rows=self._rows,
             contacts=self._contacts,
@@ -113,6 +114,10 @@ class _WatchedGroup:
         """Return the address of the pairs for C; uses the kernels compiled meanwhile."""
         self._program.refresh()
         return self._program.address
+
+    def keeps(self, floor: float) -> bool:
+        """Return whether no distance in the present state is below `floor`, m."""
+        return bool(self._lower.min(initial=np.inf) >= floor)
 
     def near(self, X: Array, limit: float, by_fcl: bool, wanted: Wanted | None) -> Found:
         """Return the `wanted` contacts nearer than `limit`, m, in the present state `X`."""
@@ -167,6 +172,11 @@ class Watch:
         return self._scene.contacts(
             [pairs.near(X, limits[pairs.group.is_self], by_fcl, wanted) for pairs in near]
         )
+
+    def keeps(self, X: Array, floor: float, self_floor: float) -> bool:
+        """Return whether `X` is the present state, and no surface distance there is below its floor, m."""
+        floors = floor, self_floor
+        return self._is_at(X) and all(pairs.keeps(floors[pairs.group.is_self]) for pairs in self._groups)
 
     def follow(self, places: Array, floor: float, self_floor: float) -> bool:
         """Return whether no surface distance falls below its floor, m, on a path of straight pieces.

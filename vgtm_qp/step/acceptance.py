@@ -76,7 +76,7 @@ class Acceptance:
         if not norm(wrong) <= enough:
             return f"the new state has {self._worst(wrong)} from the value that it is said to have"
         if goal is not None:
-            off = self._tip_error(q, X, goal)
+            off = self._tip_error(X, goal)
             if not off <= self._tip + rounding:
                 return f"the new state has its tip {off:.3g} m from its goal"
         return ""
@@ -86,9 +86,9 @@ class Acceptance:
         k = int(np.argmax(np.abs(errors)))
         return f"{self._arm.quantity_names[k]} {abs(errors[k]):.3g} m or rad"
 
-    def _tip_error(self, q: Array, X: Array, goal: TipGoal) -> float:
+    def _tip_error(self, X: Array, goal: TipGoal) -> float:
         """Return the norm of the tip's error, m: angles times the arm's unit."""
         if self._task.turns is not None:
-            self._kinematics.evaluate_quantities(q)
+            self._kinematics.evaluate_tip(X)
         position = self._arm.end_effector.position(X)
         return self._task.off(position, self._kinematics.tip_rotation, goal)

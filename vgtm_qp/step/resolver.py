@@ -235,9 +235,9 @@ class Resolver(ChangingScene):
     def tip(self) -> tuple[Array, Array]:
         """Return position (3,), m, and rotation (3, 3) of the end effector in the present state."""
         with self._lock:
-            kinematics = self.setup.kinematics
-            kinematics.evaluate(self.state.q)
-            return self.setup.arm.end_effector.position(self.state.nodes), kinematics.tip_rotation.copy()
+            kinematics, nodes = self.setup.kinematics, self.state.nodes
+            kinematics.evaluate_tip(nodes)
+            return self.setup.arm.end_effector.position(nodes), kinematics.tip_rotation.copy()
 
     def follow(self, path: Path, start: float, end: float, *, dt: float | None = None) -> Step:
         """Move along `path` from its value `start` towards `end` in one step of `dt`, s, by default the problem's.
