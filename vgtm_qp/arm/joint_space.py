@@ -91,8 +91,11 @@ class JointSpaceArm(Arm):
     ----------
     followers : tuple of Follower
         Joints that follow others; a follower follows no follower.
-    functions : (casadi.Function, casadi.Function)
-        (q, *constants) -> nodes (3, N), m; and (q, *constants) -> nodes and their Jacobian (3 N, J).
+    functions : three of casadi.Function
+        (q, *constants) -> nodes (3, N), m; nodes and their Jacobian (3 N, J); nodes and twists (6, J) of the joints,
+        the turn of each and the velocity of its body at the origin.
+    movers : (N,) int
+        Numbers of joints, from the base, that move each node.
     constants : mapping
         Arguments of these besides the configuration, the columns of each as rows.
     revolute : (J,) bool
@@ -104,7 +107,8 @@ class JointSpaceArm(Arm):
     bays = None
     leaves_chords = True
     followers: tuple[Follower, ...] = ()
-    functions: tuple[ca.Function, ca.Function]
+    functions: tuple[ca.Function, ca.Function, ca.Function]
+    movers: Index
     constants: Mapping[str, Array]
     revolute: Mask
     reaches: Array
@@ -258,7 +262,7 @@ class JointSpaceSymbols(ArmSymbols):
     def __init__(self, arm: JointSpaceArm, constants: Constants) -> None:
         super().__init__(arm.home_quantities, arm.actuators, constants)
         self._joints, self._free, self._arm = len(arm.quantity_names), arm.free.tolist(), arm
-        self._nodes, self._moving = arm.functions
+        self._nodes, self._moving, self._turning = arm.functions
         self.shape, self.given = (self._joints + 6, 1), list(range(len(arm.home)))
         self._constants = [constants.add(name, value) for name, value in arm.constants.items()]
 
@@ -281,6 +285,13 @@ class JointSpaceSymbols(ArmSymbols):
 
     def response(self, q: ca.MX, at: ca.MX, moved: ca.MX) -> ca.MX:
         return ca.horzcat(*self.motion(q, at, moved))
+
+    def twists(self, at: ca.MX) -> ca.MX | None:
+        """See ``arm.ArmSymbols``; with followers a joint moves nodes by several twists."""
+        if self._arm.followers:
+            return None
+        _, twists = self._turning(at, *self._constants)
+        return twists[:, self._actuators]
 
     def coordinates(self, nodes: Any, strokes: Any) -> Any:  # noqa: ARG002
         """See ``arm.ArmSymbols``: the actuators."""

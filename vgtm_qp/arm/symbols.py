@@ -112,6 +112,10 @@ class ArmSymbols(ABC):
     def response(self, q: Any, at: Any, moved: Any) -> Any:
         """Return [K, r] (3 (N - N_c), n_a + 1) with K at `at` and r from the residuals at `q`."""
 
+    def twists(self, at: Any) -> Any:  # noqa: ARG002
+        """Return (6, n_a) twists of the actuators, see ``JointSpaceArm.functions``; None if nodes do not move so."""
+        return None
+
     @abstractmethod
     def coordinates(self, nodes: Any, strokes: Any) -> Any:
         """Return the displacements that move the configuration: of the nodes (3 (N - N_c), c), or strokes (n_a, c)."""

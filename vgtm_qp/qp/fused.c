@@ -32,7 +32,16 @@ typedef struct {
     int (*other)(void);
     double feasibility;
 
-    const double *stack, *linear, *curvature, *offset, *normal, *leg_rows, *leg_lower;
+    /* Where actuators move nodes by twists; null elsewhere. Then the stack has no rows of the nodes, and its entries for
+       the actuators are products of wrenches and twists. */
+    const double *twists;          /* (n_a, 6): turn, and velocity at the origin */
+    const double *free, *known;    /* (N - N_c, 3) free nodes, and their motions with the base */
+    const double *wrenches;        /* (n_e + L, 6): of the rows of the tip, then of the stack */
+    const double *tip_rates;       /* (n_e): the last column of the rows of the tip */
+    const int *movers, *row_movers;    /* (N - N_c), (n_e + L): numbers of actuators, from the first, that move them */
+
+    double *stack;
+    const double *linear, *curvature, *offset, *normal, *leg_rows, *leg_lower;
     const int *hard_at;            /* (H) columns of the stack */
     const double *curve_hessian;   /* (D, D) */
     const double *goal_pull, *goal_weight;     /* (V, 3), (V) of the control vertices' goals */
@@ -77,21 +86,92 @@ static double norm(const double *a, int count)
     return sqrt(dot(a, a, count));
 }
 
+/* Numbers that sum up nodes: their number, places (3), products of these (xx, xy, xz, yy, yz, zz), known motions (3) and
+   the moments of these (3). */
+enum { SUMS = 16 };
+
+static void cross(const double *a, const double *b, double *c)
+{
+    c[0] = a[1] * b[2] - a[2] * b[1];
+    c[1] = a[2] * b[0] - a[0] * b[2];
+    c[2] = a[0] * b[1] - a[1] * b[0];
+}
+
+/* Entries of the stack and of the tip's rows for actuators that move nodes by twists. */
+static void expand(Fused *f)
+{
+    int n = f->unknowns, count = f->actuators, rows = f->squares;
+    for (int i = 0; i < count; i++)
+        for (int k = 0; k < rows; k++)
+            f->stack[i * rows + k] =
+                i < f->row_movers[f->tips + k] ? dot(f->wrenches + 6 * (f->tips + k), f->twists + 6 * i, 6) : 0.0;
+    for (int k = 0; k < f->tips; k++) {
+        double *row = f->constraint + k * n;
+        memset(row, 0, sizeof(double) * n);
+        for (int i = 0; i < f->row_movers[k]; i++) row[i] = dot(f->wrenches + 6 * k, f->twists + 6 * i, 6);
+        row[n - 1] = f->tip_rates[k];
+    }
+}
+
+/* Hessian and gradient of the node rate where actuators move nodes by twists. An actuator moves the nodes of those
+   after it, too: sums over the nodes that it moves take the place of a Jacobian. */
+static void node_rate(Fused *f)
+{
+    int n = f->unknowns, count = f->actuators;
+    double *sums = f->work, weight = 1.0 / (f->scale * f->scale), moment[3];
+    memset(sums, 0, sizeof(double) * SUMS * (count + 1));
+    for (int k = 0; k < f->nodes / 3; k++) {
+        const double *x = f->free + 3 * k, *known = f->known + 3 * k;
+        double *s = sums + SUMS * f->movers[k];
+        s[0] += 1.0;
+        cross(x, known, moment);
+        for (int a = 0, p = 4; a < 3; a++) {
+            s[1 + a] += x[a];
+            s[10 + a] += known[a];
+            s[13 + a] += moment[a];
+            for (int b = a; b < 3; b++) s[p++] += x[a] * x[b];
+        }
+    }
+    for (int j = count - 1; j >= 0; j--) {
+        const double *s = sums + SUMS * (j + 1), *w = f->twists + 6 * j, *v = w + 3;
+        double force[6], turned[3], trace = s[4] + s[7] + s[9];
+        cross(s + 1, v, force);
+        cross(w, s + 1, turned);
+        force[0] += trace * w[0] - s[4] * w[0] - s[5] * w[1] - s[6] * w[2];
+        force[1] += trace * w[1] - s[5] * w[0] - s[7] * w[1] - s[8] * w[2];
+        force[2] += trace * w[2] - s[6] * w[0] - s[8] * w[1] - s[9] * w[2];
+        for (int a = 0; a < 3; a++) force[3 + a] = turned[a] + s[0] * v[a];
+        for (int i = 0; i <= j; i++)
+            f->hessian[i * n + j] = f->hessian[j * n + i] = weight * dot(force, f->twists + 6 * i, 6);
+        f->gradient[j] = weight * (dot(w, s + 13, 3) + dot(v, s + 10, 3));
+        for (int k = 0; k < SUMS; k++) sums[SUMS * j + k] += s[k];
+    }
+}
+
 /* Hessian and gradient of the objective: the Gram matrix of the stack, whose last row is its constant, and the parts
    of the curve and the actuators. Equalities have no weight. */
 static void objective(Fused *f)
 {
     int n = f->unknowns, count = f->actuators, rows = f->squares, last = n - 1, curve = last - count;
     double *free_rows = f->work, *H = f->hessian, *g = f->gradient;
-    memcpy(free_rows, f->stack, sizeof(double) * n * rows);
-    for (int k = 0; k < f->hard; k++)
-        for (int i = 0; i < n; i++) free_rows[i * rows + f->hard_at[k]] = 0.0;
+    memset(H, 0, sizeof(double) * n * n);
+    memset(g, 0, sizeof(double) * n);
+    if (f->twists) node_rate(f);
+    double *to = free_rows;
+    for (int i = 0; i < n; i++)
+        for (int k = 0, from = 0; k <= f->hard; k++) {
+            int until = k < f->hard ? f->hard_at[k] : rows;
+            memcpy(to, f->stack + i * rows + from, sizeof(double) * (until - from));
+            to += until - from;
+            from = until + 1;
+        }
+    rows -= f->hard;
     for (int i = 0; i < n; i++) {
         int to = i < last ? i + 1 : last;
         for (int j = 0; j < to; j++) {
             double sum = dot(free_rows + i * rows, free_rows + j * rows, rows);
-            if (i < last) H[i * n + j] = H[j * n + i] = sum;
-            else g[j] = sum + f->linear[j];
+            if (i < last) H[j * n + i] = H[i * n + j] += sum;
+            else g[j] += sum + f->linear[j];
         }
     }
     g[last] = f->linear[last];
@@ -142,6 +222,13 @@ static void constrain(Fused *f)
             int column = f->node_column[nodes[s]];
             const double *part = parts + 3 * s;
             if (column < 0 || (part[0] == 0.0 && part[1] == 0.0 && part[2] == 0.0)) continue;
+            if (f->twists) {
+                double wrench[6] = {0.0, 0.0, 0.0, part[0], part[1], part[2]};
+                cross(f->free + column, part, wrench);
+                for (int i = 0; i < f->movers[column / 3]; i++) row[i] += dot(wrench, f->twists + 6 * i, 6);
+                known += dot(part, f->known + column, 3);
+                continue;
+            }
             for (int i = 0; i < count; i++)
                 row[i] += f->scale * dot(part, f->stack + i * f->squares + column, 3);
             known += f->scale * dot(part, f->stack + last * f->squares + column, 3);
@@ -180,6 +267,7 @@ EXPORT int solve(Fused *f)
 {
     int rows = f->tips + f->hard + f->legs + f->near;
     if (call(&f->condense)) return NO_VALUE;
+    if (f->twists) expand(f);
     objective(f);
     constrain(f);
     if (f->other) {
@@ -205,20 +293,42 @@ EXPORT int solve(Fused *f)
     return DONE;
 }
 
+/* The greatest displacement of a node's coordinate by the changes x of the actuators, with the known motions if `whole`;
+   NaN stays. Actuators move nodes by twists. */
+static double furthest_by_twists(Fused *f, const double *x, int whole)
+{
+    double *twist = f->work, furthest = 0.0, turned[3];
+    memset(twist, 0, sizeof(double) * 6);
+    for (int i = 0; i < f->actuators; i++)
+        for (int a = 0; a < 6; a++) twist[6 * (i + 1) + a] = twist[6 * i + a] + x[i] * f->twists[6 * i + a];
+    for (int k = 0; k < f->nodes; k += 3) {
+        const double *of = twist + 6 * f->movers[k / 3];
+        cross(of, f->free + k, turned);
+        for (int a = 0; a < 3; a++) {
+            double moved = fabs(turned[a] + of[3 + a] + (whole ? f->known[k + a] : 0.0));
+            if (moved > furthest || moved != moved) furthest = moved;
+        }
+    }
+    return furthest;
+}
+
 /* Move q and the curve by the changes x of the unknowns; `whole` adds the motions by residuals. */
 static void advance(Fused *f, const double *x, int whole)
 {
     int count = f->actuators, last = f->unknowns - 1;
     double *moved = f->work;
-    memset(moved, 0, sizeof(double) * f->nodes);
-    if (whole) memcpy(moved, f->stack + last * f->squares, sizeof(double) * f->nodes);
-    for (int i = 0; i < count; i++)
-        for (int k = 0; k < f->nodes; k++) moved[k] += x[i] * f->stack[i * f->squares + k];
-    f->furthest = 0.0;
-    for (int k = 0; k < f->nodes; k++) {
-        moved[k] *= f->scale;
-        /* NaN stays. */
-        if (fabs(moved[k]) > f->furthest || moved[k] != moved[k]) f->furthest = fabs(moved[k]);
+    if (f->twists) f->furthest = furthest_by_twists(f, x, whole);
+    else {
+        memset(moved, 0, sizeof(double) * f->nodes);
+        if (whole) memcpy(moved, f->stack + last * f->squares, sizeof(double) * f->nodes);
+        for (int i = 0; i < count; i++)
+            for (int k = 0; k < f->nodes; k++) moved[k] += x[i] * f->stack[i * f->squares + k];
+        f->furthest = 0.0;
+        for (int k = 0; k < f->nodes; k++) {
+            moved[k] *= f->scale;
+            /* NaN stays. */
+            if (fabs(moved[k]) > f->furthest || moved[k] != moved[k]) f->furthest = fabs(moved[k]);
+        }
     }
     const double *coordinates = f->by_nodes ? moved : x;
     for (int k = 0; k < f->places; k++) f->q[f->place[k]] += f->share[k] * coordinates[f->of[k]];
@@ -309,7 +419,7 @@ static void change_by(const Fused *f, const Gain *g, const double *missing, doub
 EXPORT int settle(Fused *f)
 {
     int n = f->unknowns, m = f->tips + f->hard, steps = 0, counted = 0;
-    double *step = f->work + f->nodes + n * f->squares, *work = step + (f->settling_steps + 1) * n;
+    double *step = f->work + f->nodes + SUMS * (f->actuators + 1) + n * f->squares, *work = step + (f->settling_steps + 1) * n;
     double furthest = f->furthest;
     Gain gain;
     for (;;) {

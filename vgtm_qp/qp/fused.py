@@ -15,6 +15,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from vgtm_qp.arm.joint_space import JointSpaceArm
 from vgtm_qp.arm.symbols import Constants
 from vgtm_qp.arrays import Array
 from vgtm_qp.compiled import Kernel
@@ -200,8 +201,7 @@ class FusedSolver:
         """Return the solution of the unknowns `x`; without the motions by residuals unless it `moves`."""
         work, layout, constant = self._workspace, self.layout, float(moves)
         count, nodes = work.actuators, np.zeros((len(layout.arm.node_names), 3))
-        moved = x[:count] @ work.response[:count] + constant * work.response[-1]
-        nodes[layout.arm.free] = moved.reshape(-1, 3) / np.sqrt(layout.weights.node_rate)
+        nodes[layout.arm.free] = work.displacement(x, constant)
         vertices = constant * work.offset
         if layout.vertices:
             vertices[1] += work.normal * x[count]
@@ -241,6 +241,8 @@ class _FusedWorkspace:
         self.actuators, self.equal = len(arm.actuators), equal
         self.size, self.first_near = self.actuators + layout.free_curve + 1, equal + len(layout.legs)
         self.torsion, self.shape = self.size - 1 - layout.torsion, arm.home_configuration.shape
+        movers = _movers(layout) if self.condense.outputs[10:] else None
+        self._movers, self._row_movers = movers or (None, None)
         self._is_ready: bool | None = None
         self._accuracy: Accuracy | None = None
         self._goals: object = None
@@ -324,6 +326,16 @@ class _FusedWorkspace:
                 enough_tip=enough_tip_error(home, accuracy.tip),
             )
 
+    def displacement(self, x: Array, constant: float) -> Array:
+        """Return (N - N_c, 3) displacements of the free nodes by unknowns `x`, and `constant` times the known ones, m."""
+        count = self.actuators
+        if self._movers is None:
+            moved = x[:count] @ self._response[:count] + constant * self._response[-1]
+            return np.asarray(moved.reshape(-1, 3) / np.sqrt(self._layout.weights.node_rate))
+        twists, places, known = (values.reshape(-1, size) for values, size in zip(self._bodies, (6, 3, 3), strict=True))
+        summed = np.concatenate([np.zeros((1, 6)), np.cumsum(x[:count, None] * twists, axis=0)])[self._movers]
+        return np.asarray(np.cross(summed[:, :3], places) + summed[:, 3:] + constant * known)
+
     def take(self, clearance: ClearanceRows) -> int:
         """Give the rows of clearance to the QP, and return their number."""
         near, slots = clearance.nodes.shape
@@ -355,19 +367,35 @@ class _FusedWorkspace:
             close.bind_input(argument, shared)
         self.q, self.points, self.gone = missing.inputs[0], missing.inputs[3], missing.inputs[common]
         self.started, self.started_points = self.q.copy(), self.points.copy()
-        size, equal, nodes, rows = self.size, self.equal, layout.node_columns, layout.least_squares
+        size, equal, nodes = self.size, self.equal, layout.node_columns
+        rows = layout.least_squares - (0 if self._movers is None else nodes)
         self.hessian, self.gradient, self.x = np.zeros((size, size)), np.zeros(size), np.zeros(size)
         out = condense.outputs
-        self.response, self.offset, self.normal = (
-            out[0].reshape(size, rows)[:, :nodes],
-            out[6].reshape(-1, 3),
-            out[7],
-        )
-        work = nodes + size * (rows + size + equal + SETTLING_STEPS + 4) + equal * (equal + 1)
+        self.offset, self.normal = out[6].reshape(-1, 3), out[7]
+        sums = 16 * (self.actuators + 1)
+        work = nodes + sums + size * (rows + size + equal + SETTLING_STEPS + 4) + equal * (equal + 1)
         self._program = Program(SOURCE, "Fused")
         self._program.set(**_numbers(layout), **_daqp(), unknowns=size)
+        if self._movers is None:
+            stack, self._response = out[0], out[0].reshape(size, rows)[:, :nodes]
+        else:
+            # The kernel writes the columns after those of the actuators, in place.
+            stack = np.zeros(size * rows)
+            condense.bind_output(0, stack[self.actuators * rows :])
+            self._bodies = out[10:13]
+            self._program.set(
+                twists=out[10],
+                free=out[11],
+                known=out[12],
+                wrenches=out[13],
+                tip_rates=out[1],
+                movers=self._movers.astype(np.int32),
+                row_movers=self._row_movers.astype(np.int32),
+            )
         self._program.set(
-            stack=out[0],
+            stack=stack,
+            squares=rows,
+            hard_at=(rows - (layout.least_squares - nodes) + layout.hard).astype(np.int32),
             linear=out[4],
             curvature=out[5],
             offset=out[6],
@@ -411,7 +439,8 @@ class _FusedWorkspace:
         # The kernel writes the tip's rows, and the bounds up to these, in place.
         of_tip = (self.constraint[:tips].reshape(-1), self.lower[: size + tips], self.upper[: size + tips])
         for result, array in enumerate(of_tip, start=1):
-            self.condense.bind_output(result, array)
+            if result > 1 or self._movers is None:
+                self.condense.bind_output(result, array)
         self._program.set(
             near_nodes=self._near_nodes,
             near_rows=self._near_rows,
@@ -432,7 +461,6 @@ def _numbers(layout: Layout) -> dict[str, Any]:
     return {
         "actuators": len(arm.actuators),
         "nodes": nodes,
-        "squares": layout.least_squares,
         "tips": len(layout.tip_rows),
         "hard": len(layout.hard),
         "legs": len(layout.legs),
@@ -450,13 +478,27 @@ def _numbers(layout: Layout) -> dict[str, Any]:
         "closing_steps": MOST_STEPS,
         "too_far": TOO_FAR * arm.unit,
         "feasibility": DAQP.accuracy * arm.fineness,
-        "hard_at": (nodes + layout.hard).astype(np.int32),
         "places": len(place),
         "place": place,
         "of": of,
         "share": share,
         "node_column": layout.node_column.astype(np.int32),
     }
+
+
+def _movers(layout: Layout) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return how many actuators, from the first, move each free node and each row of tip, gaps, turns and spacings."""
+    arm = layout.arm
+    assert isinstance(arm, JointSpaceArm)
+    moved = np.concatenate([[0], np.cumsum(arm.actuated)])[arm.movers]
+    stations = arm.stations
+    nodes = moved[stations.nodes[layout.tracked]]
+    # An actuator may count that moves none of a row's nodes, as its axis goes through these.
+    gaps = np.where(stations.weights[layout.tracked] != 0.0, nodes, 0).max(axis=1, initial=0)
+    turns = nodes.max(axis=1, initial=0)
+    rows = [np.full(len(layout.tip_rows), moved[arm.end_effector.nodes].max()), np.repeat(gaps, 3)]
+    rows += [np.repeat(turns, layout.turns), np.zeros(layout.spacings)]
+    return moved[arm.free], np.concatenate(rows).astype(np.int64)
 
 
 def _places(layout: Layout) -> tuple[NDArray[np.int32], NDArray[np.int32], Array, bool]:

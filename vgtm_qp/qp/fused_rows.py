@@ -21,13 +21,21 @@ def row_function(layout: Layout) -> Bound:
     the Hessian and, in its last column, the gradient of the least-squares terms; tip rows (n_a + q + 1, n_e); lower and
     upper bounds (n_a + q + 1 + n_e) of the unknowns and tip rows; gradient of the other terms (n_a + q + 1); curvature
     of the progress; offsets (3, V) of the control vertices; base normal (3); rows (q, G) and bounds (G) of the legs.
+
+    If the actuators move the nodes by twists, R lacks the rows of the nodes and the columns of the actuators, and the
+    tip rows are their last column. Further results then give the rest: twists (6, n_a); the free nodes at `at`
+    (3, N - N_c) and their motions with the base; wrenches (6, n_e + (3 + R) K + S) of the tip rows, then those of R. A
+    row's entry in the column of an actuator that moves all its nodes is the product of wrench and twist.
     """
     constants, arm, weights = Constants(), layout.arm, layout.weights
     graph = StepGraph(layout, arm.symbols(constants), constants)
     (node_rate,) = graph.weights(weights.node_rate)
     centring = graph.table("centring", layout.centring_weights)
-    response = graph.symbols.response(graph.q, graph.at, graph.moved)
-    actuators, free, rows = len(arm.actuators), layout.free_curve, len(layout.tip_rows)
+    twists = graph.symbols.twists(graph.at)
+    actuators = len(arm.actuators) if twists is None else 0
+    moved = ca.vec(graph.moved[:, arm.free.tolist()])
+    response = graph.symbols.response(graph.q, graph.at, graph.moved) if twists is None else moved
+    free, rows = layout.free_curve, len(layout.tip_rows)
     place = {int(node): 3 * k for k, node in enumerate(arm.free)}
 
     def displacement(nodes: list[int]) -> ca.MX:
@@ -41,17 +49,25 @@ def row_function(layout: Layout) -> Bound:
         ]
         return ca.vertcat(*parts)
 
-    tip_rows = graph.tip_jacobian @ displacement(arm.end_effector.nodes.tolist())
-    top = ca.sqrt(node_rate) * response
-    top = ca.horzcat(top[:, :-1], ca.MX.zeros(layout.node_columns, free), top[:, -1])
+    tip_nodes = arm.end_effector.nodes.tolist()
+    tip_rows = graph.tip_jacobian @ displacement(tip_nodes)
+    stack, wrenches = _tracking_rows(graph, displacement, actuators) if layout.vertices else ([], [])
+    if twists is None:
+        top = ca.sqrt(node_rate) * response
+        stack.insert(0, ca.horzcat(top[:, :-1], ca.MX.zeros(layout.node_columns, free), top[:, -1]))
+        bodies = []
+    else:
+        stack, tip_rows = stack or [ca.MX.zeros(0, 1)], ca.horzcat(tip_rows[:, :0], tip_rows[:, -1])
+        tip = _wrenches(graph.tip_jacobian, graph.Y[:, tip_nodes])
+        bodies = [twists, graph.Y[:, arm.free.tolist()], moved, ca.horzcat(tip, *wrenches)]
     home = graph.symbols.home[arm.actuators.tolist()]
     unbounded = ca.DM.ones(free) * UNBOUNDED
     value = graph.tip_error - tip_rows[:, -1]
     return graph.bound(
         "rows",
         [
-            ca.vertcat(top, *(_tracking_rows(graph, displacement) if layout.vertices else ())),
-            ca.horzcat(tip_rows[:, :-1], ca.MX.zeros(rows, free), -graph.tip_rate).T,
+            ca.vertcat(*stack),
+            ca.horzcat(tip_rows[:, :-1], ca.MX.zeros(rows, free if twists is None else 0), -graph.tip_rate).T,
             ca.vertcat(graph.lower - graph.strokes, -unbounded, -graph.progress, value),
             ca.vertcat(graph.upper - graph.strokes, unbounded, 1.0 - graph.progress, value),
             ca.vertcat(
@@ -64,8 +80,16 @@ def row_function(layout: Layout) -> Bound:
             graph.normal,
             _leg_rows(graph),
             graph.leg_lower,
+            *bodies,
         ],
     )
+
+
+def _wrenches(rows: ca.MX, nodes: ca.MX) -> ca.MX:
+    """Return (6, R) the wrenches of rows (R, 3 K) over nodes (3, K): sums of moments and of forces."""
+    forces = [rows[:, 3 * k : 3 * k + 3].T for k in range(nodes.shape[1])]
+    moments = [ca.skew(nodes[:, k]) @ force for k, force in enumerate(forces)]
+    return ca.vertcat(sum(moments[1:], moments[0]), sum(forces[1:], forces[0]))
 
 
 def _leg_rows(graph: StepGraph) -> ca.MX:
@@ -82,19 +106,25 @@ def _leg_rows(graph: StepGraph) -> ca.MX:
     return rows
 
 
-def _tracking_rows(graph: StepGraph, displacement: Callable[[list[int]], ca.MX]) -> list[ca.MX]:
-    """Return the rows of all gaps, turns and spacings, times the roots of their weights; hard rows times 1."""
+def _tracking_rows(
+    graph: StepGraph, displacement: Callable[[list[int]], ca.MX], actuators: int
+) -> tuple[list[ca.MX], list[ca.MX]]:
+    """Return the rows of all gaps, turns and spacings, times the roots of their weights; hard rows times 1.
+
+    And their wrenches. There are columns of as many `actuators` as `displacement` has.
+    """
     layout, arm, weights = graph.layout, graph.layout.arm, graph.layout.weights
-    actuators = len(arm.actuators)
     tracking, tangent, roll, spacing = graph.weights(
         weights.tracking, weights.tangent, weights.roll, weights.spacing
     )
     station, motion, offset = _condensed_station(layout, actuators), graph.motion, graph.offset
     every = offset if layout.general is None else ca.vertcat(ca.vec(offset), ca.MX.zeros(layout.torsion))
     scales = ca.repmat(ca.sqrt(tracking), 3), ca.sqrt(ca.vertcat(tangent, tangent, roll)[: layout.turns])
-    gaps, tilts = [], []
+    gaps, tilts, gap_wrenches, tilt_wrenches = [], [], [], []
+    wrench = _station_wrenches(layout)
     for k, face in enumerate(layout.tracked.tolist()):
-        moving = displacement(arm.stations.nodes[face].tolist())
+        nodes = arm.stations.nodes[face].tolist()
+        moving = displacement(nodes)
         hard = [ca.DM(mask[k].astype(float)) for mask in (layout.hard_gaps, layout.hard_tilts)]
         # Corrections close hard rows as well, without a weight.
         closed = [mask + (1.0 - mask) * motion for mask in hard]
@@ -103,11 +133,27 @@ def _tracking_rows(graph: StepGraph, displacement: Callable[[list[int]], ca.MX])
         gap, tilt = (ca.repmat(w, 1, row.shape[1]) * row for w, row in zip(weighed, rows, strict=True))
         gaps.append(gap)
         tilts.append(tilt)
+        of_gap, of_tilt = wrench(*graph.station(k), graph.Y[:, nodes], *weighed)
+        gap_wrenches.append(of_gap)
+        tilt_wrenches.append(of_tilt)
     if layout.spacings:
         pieces, rows = graph.given[4], graph.given[5].T
         stretch = ca.horzcat(curve_rows.free_columns(rows, graph.normal), motion * pieces + rows @ every)
         tilts.append(ca.sqrt(spacing) * ca.horzcat(ca.MX.zeros(layout.spacings, actuators), stretch))
-    return gaps + tilts
+        tilt_wrenches.append(ca.MX.zeros(6, layout.spacings))
+    return gaps + tilts, gap_wrenches + tilt_wrenches
+
+
+def _station_wrenches(layout: Layout) -> ca.Function:
+    """Return the wrenches (6, 3) of gap and (6, R) of turn rows of one station, times weights (3) and (R)."""
+    station, places = StationSymbols(layout), ca.SX.sym("places", 3, 3)
+    weights = ca.SX.sym("gap_weight", 3), ca.SX.sym("turn_weight", layout.turns)
+    rows = ca.kron(station.weights.T, ca.SX.eye(3)), station.face
+    wrenches = [
+        _wrenches(ca.diag(weight) @ row, places) for weight, row in zip(weights, rows, strict=True)
+    ]
+    inputs = [*station.inputs, places, *weights]
+    return ca.Function("wrench", inputs, [ca.densify(wrench) for wrench in wrenches])
 
 
 def _curve_gradient(graph: StepGraph) -> ca.MX:

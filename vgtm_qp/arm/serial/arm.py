@@ -49,6 +49,7 @@ class SerialArm(JointSpaceArm):
         chain = SerialChain.of(spec, hulls)
         self.chain = chain if spec.every else replace(chain, every=self._every(chain))
         self.functions, self.constants = self.chain.functions, self.chain.constants
+        self.movers = self.chain.movers
         self.revolute, self.reaches = chain.revolute, self._reaches()
         self.actuator_units = tuple("rad" if turns else "m" for turns in self.revolute[self.actuated])
         self._place_stations(spec.tip_rotation_vector)

@@ -122,8 +122,11 @@ class SerialChain:
         }
 
     @cached_property
-    def functions(self) -> tuple[ca.Function, ca.Function]:
-        """Return the nodes (3, N) and their Jacobian (3 N, J) as functions; the first gives the nodes alone.
+    def functions(self) -> tuple[ca.Function, ca.Function, ca.Function]:
+        """Return three functions, of the nodes (3, N): alone, with their Jacobian (3 N, J), and with twists (6, J).
+
+        The twist of a joint is its axis, if it turns, and the velocity of a point of its body at the origin: a node at
+        x that the joint moves has the velocity axis x x + velocity, see :attr:`movers`.
 
         Arguments: q, axes (3, J), positions (3, J), rotations (3, 3 J), tip (3), points (3, P).
 
@@ -136,41 +139,44 @@ class SerialChain:
         positions, rotations = ca.MX.sym("positions", 3, count), ca.MX.sym("rotations", 3, 3 * count)
         tip, points = ca.MX.sym("tip", 3), ca.MX.sym("points", 3, len(self.points))
         origin, frame = q[count : count + 3], _turned()(q[count + 3 :])
-        # Each node and station is paired with the number of joints that move it.
-        nodes, stations, frames = [(origin, 0)], [(origin, frame, 0)], [(origin, frame)]
+        nodes, stations, frames = [origin], [(origin, frame)], [(origin, frame)]
         directions, places = [], []
         for j, turns in enumerate(self.revolute.tolist()):
             geometry = axes[:, j], positions[:, j], rotations[:, 3 * j : 3 * j + 3]
             place, direction, origin, frame = _joint(turns)(origin, frame, q[j], *geometry)
             directions.append(direction)
             places.append(place)
-            nodes.append((place, j))
+            nodes.append(place)
             if j in self.tracked:
-                # A station turns with its revolute joint; that of a prismatic joint does not move with the
-                # slide.
-                stations.append((place, frame, j + 1 if turns else j))
+                stations.append((place, frame))
             frames.append((origin, frame))
         end = origin + frame @ tip
-        nodes.append((end, count))
-        stations.append((end, frame, count))
+        nodes.append(end)
+        stations.append((end, frame))
         for k, carrier in enumerate(self.carriers.tolist()):
             at, attitude = frames[carrier]
-            nodes.append((at + attitude @ points[:, k], carrier))
-        for place, attitude, moving in stations:
-            nodes += [(place + self.spread * attitude[:, axis], moving) for axis in (0, 1)]
-        every, movers = ca.horzcat(*(node for node, _ in nodes)), ca.DM([moving for _, moving in nodes])
-        jacobian = _columns(len(nodes), count)(
-            ca.horzcat(*directions),
-            ca.horzcat(*places),
-            ca.DM(self.revolute.astype(float)).T,
-            ca.DM(range(count)).T,
-            movers,
-            every,
-        )
+            nodes.append(at + attitude @ points[:, k])
+        for place, attitude in stations:
+            nodes += [place + self.spread * attitude[:, axis] for axis in (0, 1)]
+        every, movers = ca.horzcat(*nodes), ca.DM(self.movers)
+        joints = ca.horzcat(*directions), ca.horzcat(*places), ca.DM(self.revolute.astype(float)).T
+        jacobian = _columns(len(nodes), count)(*joints, ca.DM(range(count)).T, movers, every)
         arguments = [q, axes, positions, rotations, tip, points]
-        both = ca.Function("chain", arguments, [every, jacobian])
         alone = ca.Function("chain_nodes", arguments, [every])
-        return (alone, both) if count > UNROLLED else (alone.expand(), both.expand())
+        both = ca.Function("chain", arguments, [every, jacobian])
+        twists = ca.Function("chain_twists", arguments, [every, _twist().map(count)(*joints)])
+        found = alone, both, twists
+        return found if count > UNROLLED else tuple(function.expand() for function in found)
+
+    @cached_property
+    def movers(self) -> Index:
+        """(N,) numbers of joints, from the base, that move each node; others do not.
+
+        A station turns with its revolute joint; that of a prismatic joint does not move with the slide.
+        """
+        stations = [0, *(j + int(self.revolute[j]) for j in self.tracked), len(self)]
+        places = [0, *range(len(self)), len(self), *self.carriers, *np.repeat(stations, 2)]
+        return np.array(places, dtype=np.int64)
 
     def attitude(self, joints: Array, turn: Sequence[float]) -> Array:
         """Return (3, 3) the rotation, in the base's frame, of the last frame turned by the vector `turn`."""
@@ -207,6 +213,14 @@ def _joint(turns: bool) -> ca.Function:
     moved = (place, after @ rotated(value * axis)) if turns else (place + value * direction, after)
     arguments = [origin, frame, value, axis, position, rotation]
     return ca.Function("turning" if turns else "sliding", arguments, [place, direction, *moved])
+
+
+@cache
+def _twist() -> ca.Function:
+    """Return the function from direction and place (3) of a joint's axis, and whether it turns, to its twist (6)."""
+    direction, place, turns = ca.SX.sym("direction", 3), ca.SX.sym("place", 3), ca.SX.sym("turns")
+    velocity = ca.if_else(turns, ca.cross(place, direction), direction)
+    return ca.Function("twist", [direction, place, turns], [ca.vertcat(turns * direction, velocity)])
 
 
 @cache
