@@ -19,7 +19,6 @@ from vgtm_qp.arrays import Array, Index, Mask
 from vgtm_qp.compiled import Compiling, Kernel
 from vgtm_qp.rotation import vector_near
 
-
 _KNOWN = 4
 """Number of configurations whose nodes are kept."""
 
@@ -220,24 +219,8 @@ class JointSpaceArm(Arm):
         return np.where(self.revolute, self.reaches[1:], 1.0)
 
     def deviation(self, start: Array, end: Array) -> float:
+        """See ``arm.Arm``: what no node exceeds, for two of them."""
         return 2.0 * self.tip_deviation(start, end, 0.0)
-
-    def tip_deviation(self, start: Array, end: Array, reach: float) -> float:
-        """See ``arm.Arm``: an eighth of a bound of a point's second derivative, which holds for all nodes, too.
-
-        A point's velocity is sum w_j a_j x (X - o_j) + sum d_j a_j. The axes a_j turn with all joints before
-        them; X - o_j changes only by joint j and those beyond it.
-        """
-        (turn, slide), reaches = self._motions(end - start), self.reaches + reach
-        before = np.concatenate([[0.0], np.cumsum(turn)[:-1]])
-        beyond = np.cumsum((turn * reaches + slide)[::-1])[::-1]
-        return float(turn @ (2.0 * before * reaches + beyond) + slide @ before) / 8.0
-
-    def _motions(self, motion: Array) -> tuple[Array, Array]:
-        """Return turns (J + 1,), rad, and slides (J + 1,), m; the base comes first, with twice its turn."""
-        joints, base = np.abs(motion[:-6]), 2.0 * float(np.linalg.norm(motion[-3:]))
-        turn, slide = np.where(self.revolute, joints, 0.0), np.where(self.revolute, 0.0, joints)
-        return np.concatenate([[base], turn]), np.concatenate([[0.0], slide])
 
     def forces(self, q: Array, load: Array) -> Array:
         tip, constants = self.end_effector, [value.T for value in self.constants.values()]

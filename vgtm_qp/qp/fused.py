@@ -241,8 +241,7 @@ class _FusedWorkspace:
         self.actuators, self.equal = len(arm.actuators), equal
         self.size, self.first_near = self.actuators + layout.free_curve + 1, equal + len(layout.legs)
         self.torsion, self.shape = self.size - 1 - layout.torsion, arm.home_configuration.shape
-        movers = _movers(layout) if self.condense.outputs[10:] else None
-        self._movers, self._row_movers = movers or (None, None)
+        self._movers = _movers(layout) if self.condense.outputs[10:] else None
         self._is_ready: bool | None = None
         self._accuracy: Accuracy | None = None
         self._goals: object = None
@@ -327,13 +326,17 @@ class _FusedWorkspace:
             )
 
     def displacement(self, x: Array, constant: float) -> Array:
-        """Return (N - N_c, 3) displacements of the free nodes by unknowns `x`, and `constant` times the known ones, m."""
+        """Return (N - N_c, 3) displacements of the free nodes by `x`, and `constant` times the known ones, m."""
         count = self.actuators
         if self._movers is None:
             moved = x[:count] @ self._response[:count] + constant * self._response[-1]
             return np.asarray(moved.reshape(-1, 3) / np.sqrt(self._layout.weights.node_rate))
-        twists, places, known = (values.reshape(-1, size) for values, size in zip(self._bodies, (6, 3, 3), strict=True))
-        summed = np.concatenate([np.zeros((1, 6)), np.cumsum(x[:count, None] * twists, axis=0)])[self._movers]
+        twists, places, known = (
+            values.reshape(-1, size) for values, size in zip(self._bodies, (6, 3, 3), strict=True)
+        )
+        summed = np.concatenate([np.zeros((1, 6)), np.cumsum(x[:count, None] * twists, axis=0)])[
+            self._movers[0]
+        ]
         return np.asarray(np.cross(summed[:, :3], places) + summed[:, 3:] + constant * known)
 
     def take(self, clearance: ClearanceRows) -> int:
@@ -389,8 +392,8 @@ class _FusedWorkspace:
                 known=out[12],
                 wrenches=out[13],
                 tip_rates=out[1],
-                movers=self._movers.astype(np.int32),
-                row_movers=self._row_movers.astype(np.int32),
+                movers=self._movers[0],
+                row_movers=self._movers[1],
             )
         self._program.set(
             stack=stack,
@@ -486,7 +489,7 @@ def _numbers(layout: Layout) -> dict[str, Any]:
     }
 
 
-def _movers(layout: Layout) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _movers(layout: Layout) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """Return how many actuators, from the first, move each free node and each row of tip, gaps, turns and spacings."""
     arm = layout.arm
     assert isinstance(arm, JointSpaceArm)
@@ -498,7 +501,7 @@ def _movers(layout: Layout) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     turns = nodes.max(axis=1, initial=0)
     rows = [np.full(len(layout.tip_rows), moved[arm.end_effector.nodes].max()), np.repeat(gaps, 3)]
     rows += [np.repeat(turns, layout.turns), np.zeros(layout.spacings)]
-    return moved[arm.free], np.concatenate(rows).astype(np.int64)
+    return moved[arm.free].astype(np.int32), np.concatenate(rows).astype(np.int32)
 
 
 def _places(layout: Layout) -> tuple[NDArray[np.int32], NDArray[np.int32], Array, bool]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import casadi as ca
 
@@ -85,7 +86,7 @@ def row_function(layout: Layout) -> Bound:
     )
 
 
-def _wrenches(rows: ca.MX, nodes: ca.MX) -> ca.MX:
+def _wrenches(rows: Any, nodes: Any) -> Any:
     """Return (6, R) the wrenches of rows (R, 3 K) over nodes (3, K): sums of moments and of forces."""
     forces = [rows[:, 3 * k : 3 * k + 3].T for k in range(nodes.shape[1])]
     moments = [ca.skew(nodes[:, k]) @ force for k, force in enumerate(forces)]
@@ -149,9 +150,7 @@ def _station_wrenches(layout: Layout) -> ca.Function:
     station, places = StationSymbols(layout), ca.SX.sym("places", 3, 3)
     weights = ca.SX.sym("gap_weight", 3), ca.SX.sym("turn_weight", layout.turns)
     rows = ca.kron(station.weights.T, ca.SX.eye(3)), station.face
-    wrenches = [
-        _wrenches(ca.diag(weight) @ row, places) for weight, row in zip(weights, rows, strict=True)
-    ]
+    wrenches = [_wrenches(ca.diag(weight) @ row, places) for weight, row in zip(weights, rows, strict=True)]
     inputs = [*station.inputs, places, *weights]
     return ca.Function("wrench", inputs, [ca.densify(wrench) for wrench in wrenches])
 

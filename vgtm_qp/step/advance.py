@@ -83,7 +83,8 @@ class Advancer:
                 if not found.rank:
                     break
         last = best or Advance(_blocked(found.step, state, too_long or found.step.reason or _OFF_PATH), None)
-        return last._replace(step=replace(last.step, qps=self._attempt.qps - before))
+        count = self._attempt.qps - before
+        return last if last.step.qps == count else last._replace(step=replace(last.step, qps=count))
 
     def _attempts(self, state: State, target: Target, dt: float, smallest: float) -> Iterator[Advance]:
         """Yield the attempts at a target: the whole piece, halves of it if the tip may slow down, and creeping.

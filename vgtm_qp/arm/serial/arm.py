@@ -165,12 +165,11 @@ class SerialArm(JointSpaceArm):
         A joint between two bodies moves the further one by at most its turn times the length of the links up
         to there.
         """
-        turn, slide = (moved[1:] for moved in self._motions(motion))
         # For each joint, sums over the joints before it: turns, turns times lengths along the links, slides.
-        sums = np.zeros((3, len(turn) + 1))
+        sums = np.zeros((3, len(self.chain) + 1))
         # Infinite limits give NaN.
         with np.errstate(invalid="ignore"):
-            np.cumsum([turn, turn * self._ways[0][:-1], slide], axis=1, out=sums[:, 1:])
+            np.cumsum(np.abs(motion[:-6]) * self._shares, axis=1, out=sums[:, 1:])
         way, (first, last) = self._extents, self._movers
 
         def bound(body: Index, other: Index | None = None) -> Array:
@@ -183,6 +182,11 @@ class SerialArm(JointSpaceArm):
                 return np.asarray(way[further] * turns - levers + slides)
 
         return bound
+
+    @cached_property
+    def _shares(self) -> Array:
+        """(3, J) turn, turn times the length along the links up to there, and slide, per change of a joint."""
+        return np.stack([self.revolute, self.revolute * self._ways[0][:-1], ~self.revolute])
 
     @cached_property
     def _extents(self) -> Array:

@@ -12,13 +12,14 @@ import numpy as np
 
 from vgtm_qp.arm.serial.chain import SerialChain
 from vgtm_qp.arm.symbols import Bound, Constants, rotated
+from vgtm_qp.arrays import Array
 
 
 def bend_function(chain: SerialChain) -> Bound:
     """Return the function of bounds of |p''| over the straight motion between two configurations.
 
-    Arguments: configurations (J + 6), start and end. Result (3): bounds for all nodes, m; for the tip, m; and for a point
-    fixed to the tip, per distance from it.
+    Arguments: configurations (J + 6), start and end. Result (3): bounds for all nodes, m; for the tip, m; and for a
+    point fixed to the tip, per distance from it.
 
     Speeds w and accelerations w' are computed at the middle of the motion and bounded from there: in joints that turn
     to and fro they cancel, where the sums of all turns would be many times greater. A base that turns has no such
@@ -34,7 +35,9 @@ def bend_function(chain: SerialChain) -> Bound:
     # A rotation vector counts twice, as its axis turns too.
     base = 2.0 * ca.norm_2(change[count + 3 :])
     unknown = ca.if_else(base > 0.0, ca.inf, 0.0)
-    state = ca.vertcat(ca.DM.eye(3).reshape((9, 1)), ca.DM.zeros(7), base, base**2, 0.0, base**2 * furthest[0])
+    state = ca.vertcat(
+        ca.DM.eye(3).reshape((9, 1)), ca.DM.zeros(7), base, base**2, 0.0, base**2 * furthest[0]
+    )
     middle = (start + 0.5 * change)[:count]
     rows = [middle.T, change[:count].T, axes, ca.reshape(rotations, 9, count), turns.T]
     rows += [lengths[:count].T, furthest[1:].T, ca.repmat(unknown, 1, count)]
@@ -50,8 +53,8 @@ _GROWTH, _TURNED, _BEND, _BENT, _WORST = range(15, 20)
 turns; of |v''| per length of v; of |p''| at its origin, and at all nodes up to there."""
 
 
-def _furthest(chain: SerialChain) -> np.ndarray:
-    """Return (J + 1,) the greatest distances of nodes and bodies from the origins of the frames that carry them, m."""
+def _furthest(chain: SerialChain) -> Array:
+    """Return (J + 1,) the greatest distances of nodes and bodies from the origins of their frames, m."""
     found = np.full(len(chain) + 1, chain.spread)
     np.maximum.at(found, chain.carriers, chain.beyond)
     return found

@@ -165,8 +165,7 @@ class SerialChain:
         alone = ca.Function("chain_nodes", arguments, [every])
         both = ca.Function("chain", arguments, [every, jacobian])
         twists = ca.Function("chain_twists", arguments, [every, _twist().map(count)(*joints)])
-        found = alone, both, twists
-        return found if count > UNROLLED else tuple(function.expand() for function in found)
+        return (alone, both, twists) if count > UNROLLED else (alone.expand(), both.expand(), twists.expand())
 
     @cached_property
     def movers(self) -> Index:
