@@ -420,7 +420,6 @@ EXPORT int settle(Fused *f)
 {
     int n = f->unknowns, m = f->tips + f->hard, steps = 0, counted = 0;
     double *step = f->work + f->nodes + SUMS * (f->actuators + 1) + n * f->squares, *work = step + (f->settling_steps + 1) * n;
-    double furthest = f->furthest;
     Gain gain;
     for (;;) {
         if (call(&f->close)) return UNSETTLED;
@@ -452,7 +451,6 @@ EXPORT int settle(Fused *f)
         steps++;
         advance(f, next, 0);
     }
-    f->furthest = furthest;
     return f->errors[0] <= f->member && f->off <= f->tip ? DONE : UNSETTLED;
 }
 
@@ -474,5 +472,9 @@ EXPORT int move(Fused *f, double tolerance)
     advance(f, f->x, 1);
     memcpy(f->started, f->q, sizeof(double) * f->coordinates);
     memcpy(f->started_points, f->points, sizeof(double) * 3 * f->vertices);
-    return settle(f);
+    double furthest = f->furthest;
+    code = settle(f);
+    /* Not that of the last correction, which may have failed. */
+    f->furthest = furthest;
+    return code;
 }
