@@ -120,6 +120,11 @@ class MinkStep:
         return np.array(self._configuration.q)
 
     @property
+    def configuration(self) -> Array:
+        """See :class:`~vgtm_qp.bench.between.Walker`."""
+        return np.append(self.reached, np.zeros(6))
+
+    @property
     def tip(self) -> Array:
         """(3,) Position of the tip by the peer's own kinematics, m."""
         return np.array(self._configuration.get_transform_frame_to_world("tip", "site").translation())
@@ -170,6 +175,11 @@ class PinkStep:
     def reached(self) -> Array:
         """Joint values (J,) after the step, rad."""
         return np.array(self._configuration.q)
+
+    @property
+    def configuration(self) -> Array:
+        """See :class:`~vgtm_qp.bench.between.Walker`."""
+        return np.append(self.reached, np.zeros(6))
 
     @property
     def tip(self) -> Array:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from vgtm_qp.bench import BaselineName
+from vgtm_qp.bench.between import Walker, least_by_resolver, least_by_walker
 from vgtm_qp.bench.contestants import BASELINES, make_baseline
 from vgtm_qp.bench.fresh import measure_fresh, measure_start
 from vgtm_qp.bench.measure import breakdown, run_alone, run_in_turn, timing
@@ -41,7 +42,8 @@ def measure_scene(
     arm covered, 0 to 1; ``stopped_by``, what stopped it, empty where nothing did; ``step`` and ``breakdown``, see
     `measure.py`; ``qps``, QPs a step; ``fcl_rows`` and ``exact_rows``, clearance rows a step by FCL and by closed
     forms; ``warm`` and ``cold``, what `measure_fresh` returns, with ``cold`` None if it was not asked for;
-    ``baselines``, what `_against` returns, by name.
+    ``baselines``, what `_against` returns, by name; ``safe``, the clearance asked for, and ``between``, the least one
+    at and between the steps of the maneuver, m, None where no baseline can be compared in it.
 
     Each run ends after so many `steps`, or earlier: in turn with a baseline after `seconds`, alone after 30
     times as long.
@@ -52,6 +54,7 @@ def measure_scene(
     alone = run_alone(resolver, goals, seconds=_ALONE * seconds, steps=steps)
     baselines = {name: _against(scene, name, resolver, goals, seconds=seconds, steps=steps) for name in names}
     data, arm = problem.to_dict(), resolver.setup.arm
+    compared = any(found["between"] is not None for found in baselines.values())
     return {
         "name": scene.name,
         "kind": scene.kind,
@@ -71,6 +74,8 @@ def measure_scene(
         "warm": measure_fresh(data),
         "cold": measure_fresh(data, cold=True) if cold else None,
         "baselines": baselines,
+        "safe": problem.clearance.safe,
+        "between": least_by_resolver(resolver, goals) if compared else None,
     }
 
 
@@ -86,9 +91,10 @@ def _against(
     """Return a baseline's ``step``, see `timing`, and its ``ratio`` to ``ours``, median CPU times of the same steps, s.
 
     These are None if the baseline was not measured, and ``skipped`` says why; ``failed`` counts the steps
-    without its answer, which are not in the times.
+    without its answer, which are not in the times. ``between`` is the least clearance, m, at and between the steps of a
+    baseline that goes the whole way by itself, and None for all others.
     """
-    missing = {"step": None, "ours": None, "ratio": None, "failed": 0, "skipped": ""}
+    missing = {"step": None, "ours": None, "ratio": None, "failed": 0, "skipped": "", "between": None}
     try:
         baseline = make_baseline(name, scene.problem, scene.bays)
     except VgtmError as error:
@@ -97,7 +103,10 @@ def _against(
     if not pairs.theirs:
         return missing | {"failed": pairs.failed, "skipped": "found no answer to any step"}
     step, ours = timing(pairs.theirs), timing(pairs.ours)["cpu"]
-    return missing | {"step": step, "ours": ours, "ratio": pairs.ratio, "failed": pairs.failed}
+    found = {"step": step, "ours": ours, "ratio": pairs.ratio, "failed": pairs.failed}
+    if scene.problem.obstacle and isinstance(baseline, Walker):
+        found["between"] = least_by_walker(resolver.setup, goals, baseline)
+    return missing | found
 
 
 def measure(
@@ -134,26 +143,30 @@ def measure(
 
 
 def growth(scenes: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the exponent of the bays in the CPU time of a step between two cubes, by method and tracking, with FCL.
+    """Return the exponents of bays or joints in the CPU time of a step among cubes, by method and tracking, with FCL.
 
-    Fitted by least squares of the logarithms over arms of 50 bays and more, if there are at least two.
+    Fitted by least squares of the logarithms over trusses of 50 bays and more, and over snakes, if there are at least
+    two.
     """
-    points: dict[tuple[str, str], list[tuple[float, float]]] = {}
+    points: dict[tuple[str, str, str], list[tuple[float, float]]] = {}
     for scene in scenes:
-        if scene["kind"] != "cubes" or scene["bays"] < LEAST_BAYS or scene["distance"] != "fcl":
+        kind = scene["kind"]
+        grows = kind == "snake" or (kind == "cubes" and scene["bays"] >= LEAST_BAYS)
+        if not grows or scene["distance"] != "fcl":
             continue
         medians = {"qp": scene["step"]["cpu"]}
         medians |= {name: found["step"]["cpu"] for name, found in scene["baselines"].items() if found["step"]}
         for method, median in medians.items():
-            points.setdefault((method, scene["tracking"]), []).append((scene["bays"], median))
+            points.setdefault((kind, method, scene["tracking"]), []).append((scene["bays"], median))
     return [
         {
+            "kind": kind,
             "method": method,
             "tracking": tracking,
             "bays": [bays for bays, _ in found],
             "exponent": exponent(*zip(*found, strict=True)),
         }
-        for (method, tracking), found in points.items()
+        for (kind, method, tracking), found in points.items()
         if len({bays for bays, _ in found}) > 1
     ]
 

@@ -7,14 +7,19 @@ from collections.abc import Iterable, Sequence
 from itertools import product
 from typing import Any, NamedTuple, get_args
 
+import numpy as np
+
+from vgtm_qp.arm.serial.chain import SerialChain
+from vgtm_qp.arrays import Array
 from vgtm_qp.bench import DistanceName, SceneKind, TrackingName
 from vgtm_qp.problem import Problem, load_problem
+from vgtm_qp.problem.arm import ArmTable
 from vgtm_qp.problem.snake import snake
 
 KINDS: tuple[SceneKind, ...] = get_args(SceneKind)
 BAYS = (5, 20, 50, 200, 1000)
-_SNAKE = 30
-"""Joints of a snake."""
+_SNAKES = (30, 100)
+"""Joints of the snakes."""
 CLUTTERED_BAYS = 50
 CLUTTER = 100
 
@@ -91,7 +96,8 @@ def make_scenes(
     """
     scenes = []
     for kind in dict.fromkeys(kinds):
-        for count in dict.fromkeys(bays if kind == "cubes" else [_count(kind)]):
+        several: dict[SceneKind, Sequence[int]] = {"cubes": bays, "snake": _SNAKES}
+        for count in dict.fromkeys(several.get(kind, [_count(kind)])):
             variants: Iterable[Variant] = VARIANTS[kind]
             if kind == "cubes":
                 variants = (*variants, *MORE_BETWEEN_CUBES.get(count, ()))
@@ -123,7 +129,6 @@ def _count(kind: SceneKind) -> int:
         "clutter": CLUTTERED_BAYS,
         "tetrahedral": 14,
         "serial": _JOINTS,
-        "snake": _SNAKE,
     }
     return fixed.get(kind, _BUNDLED_BAYS)
 
@@ -156,29 +161,51 @@ def _serial() -> Problem:
     )
 
 
-def _snake() -> Problem:
-    """Return a snake of fifteen universal joints, 4 m long, that leans over between three cubes."""
-    cubes = (((1.3, -0.2, 1.7), 0.6), ((-0.7, -0.6, 1.5), 0.5), ((0.3, 1.2, 3.0), 0.5))
+def _snake(joints: int) -> Problem:
+    """Return a snake of universal joints that leans over between three cubes; that of 30 joints is 4 m long.
+
+    Links of longer ones are as long. Cubes stand beside the same parts of their length, and the tip moves as far.
+    """
+    cubes = (((1.3, -0.2, 1.7), 0.6, 0.56), ((-0.7, -0.6, 1.5), 0.5, 0.33), ((0.3, 1.2, 3.0), 0.5, 0.56))
+    short, home = _snake_at_home(_SNAKES[0]), _snake_at_home(joints)
+
+    def beside(part: float, place: Sequence[float]) -> list[float]:
+        shift = home[round(part * (len(home) - 1))] - short[round(part * (len(short) - 1))]
+        return [float(value) for value in shift + place]
+
     return Problem.from_dict(
         {
-            "name": "snake of 30 joints between three cubes",
-            "arm": snake(_SNAKE // 2),
+            "name": f"snake of {joints} joints between three cubes",
+            "arm": _snake_table(joints),
             "curve": {"control_vertices": 6},
-            "maneuver": {"steps": 100, "waypoint": [{"time": 10.0, "position": [2.6, -0.9, 2.2]}]},
+            "maneuver": {
+                "steps": 100,
+                "waypoint": [{"time": 10.0, "position": beside(1.0, (2.6, -0.9, 2.2))}],
+            },
             "obstacle": [
-                {"name": f"cube {k}", "shape": "box", "center": center, "size": size}
-                for k, (center, size) in enumerate(cubes, start=1)
+                {"name": f"cube {k}", "shape": "box", "center": beside(part, center), "size": size}
+                for k, (center, size, part) in enumerate(cubes, start=1)
             ],
             "clearance": {"safe": 0.08, "influence": 0.5},
         }
     )
 
 
+def _snake_table(joints: int) -> dict[str, Any]:
+    return snake(joints // 2, length=4.0 * joints / _SNAKES[0])
+
+
+def _snake_at_home(joints: int) -> Array:
+    """Return (J + 2, 3) base, joints and tip of a snake at home, m."""
+    table = ArmTable.model_validate(_snake_table(joints))
+    return SerialChain.of(table).at(np.array([*table.home_values(), *[0.0] * 6]))[0][: joints + 2]
+
+
 def _problem(kind: SceneKind, bays: int) -> Problem:
     if kind == "serial":
         return _serial()
     if kind == "snake":
-        return _snake()
+        return _snake(bays)
     if kind == "tetrahedral":
         return load_problem(_BUNDLED[kind])
     problem = load_problem(_BUNDLED[kind])

@@ -35,6 +35,7 @@ def _parts(document: dict[str, Any]) -> Iterator[str]:
     if document["baselines"]:
         yield _baselines(document)
         yield "\n".join(_legend(document))
+        yield from _between(document)
     yield _fresh(document["scenes"])
     if document["growth"]:
         yield _growth(document["growth"])
@@ -93,6 +94,21 @@ def _baselines(document: dict[str, Any]) -> str:
     return markdown_table(("CPU, and ratio to ours in turn", "ours", *names), rows, right=True)
 
 
+def _between(document: dict[str, Any]) -> Iterator[str]:
+    """Yield the least clearances at and between steps, if some baseline goes the whole way by itself."""
+    scenes = [scene for scene in document["scenes"] if scene.get("between") is not None]
+    every = (name for scene in scenes for name, found in scene["baselines"].items() if found.get("between"))
+    names = list(dict.fromkeys(every))
+    rows = []
+    for scene in scenes:
+        least = [scene["safe"], scene["between"], *(scene["baselines"][name]["between"] for name in names)]
+        rows.append((scene["name"], *("-" if value is None else f"{1e3 * value:.3f} mm" for value in least)))
+    if rows:
+        yield markdown_table(
+            ("least clearance, at and between steps", "asked for", "ours", *names), rows, right=True
+        )
+
+
 def _legend(document: dict[str, Any]) -> Iterator[str]:
     """Yield what each baseline is, and why a baseline has no column."""
     for name, title in document["baselines"].items():
@@ -132,10 +148,18 @@ def _fresh(scenes: Iterable[dict[str, Any]]) -> str:
 
 def _growth(rows: Iterable[dict[str, Any]]) -> str:
     cells = [
-        (row["method"], row["tracking"], ", ".join(map(str, row["bays"])), f"{row['exponent']:.2f}")
+        (
+            row["kind"],
+            row["method"],
+            row["tracking"],
+            ", ".join(map(str, row["bays"])),
+            f"{row['exponent']:.2f}",
+        )
         for row in rows
     ]
-    return markdown_table(("method", "tracking", "bays", "growth exponent"), cells, right=True)
+    return markdown_table(
+        ("scenes", "method", "tracking", "bays or joints", "growth exponent"), cells, right=True
+    )
 
 
 def _compared(found: dict[str, Any]) -> str:
