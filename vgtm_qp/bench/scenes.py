@@ -166,12 +166,11 @@ def _snake(joints: int) -> Problem:
 
     Links of longer ones are as long. Cubes stand beside the same parts of their length, and the tip moves as far.
     """
-    cubes = (((1.3, -0.2, 1.7), 0.6, 0.56), ((-0.7, -0.6, 1.5), 0.5, 0.33), ((0.3, 1.2, 3.0), 0.5, 0.56))
+    cubes = (((1.3, -0.2, 1.7), 0.6, 0.65), ((-0.7, -0.6, 1.5), 0.5, 0.33), ((0.3, 1.2, 3.0), 0.5, 0.56))
     short, home = _snake_at_home(_SNAKES[0]), _snake_at_home(joints)
 
     def beside(part: float, place: Sequence[float]) -> list[float]:
-        shift = home[round(part * (len(home) - 1))] - short[round(part * (len(short) - 1))]
-        return [float(value) for value in shift + place]
+        return [float(value) for value in place + (_along(home, part) - _along(short, part))]
 
     return Problem.from_dict(
         {
@@ -195,10 +194,15 @@ def _snake_table(joints: int) -> dict[str, Any]:
     return snake(joints // 2, length=4.0 * joints / _SNAKES[0])
 
 
+def _along(points: Array, part: float) -> Array:
+    """Return the point (3,) at a part, 0 to 1, of a polyline of equal legs (K, 3)."""
+    return np.array([np.interp(part, np.linspace(0.0, 1.0, len(points)), axis) for axis in points.T])
+
+
 def _snake_at_home(joints: int) -> Array:
-    """Return (J + 2, 3) base, joints and tip of a snake at home, m."""
+    """Return (J / 2 + 1, 3) universal joints and tip of a snake at home, m."""
     table = ArmTable.model_validate(_snake_table(joints))
-    return SerialChain.of(table).at(np.array([*table.home_values(), *[0.0] * 6]))[0][: joints + 2]
+    return SerialChain.of(table).at(np.array([*table.home_values(), *[0.0] * 6]))[0][1 : joints + 2 : 2]
 
 
 def _problem(kind: SceneKind, bays: int) -> Problem:
