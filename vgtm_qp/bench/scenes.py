@@ -164,9 +164,10 @@ def _serial() -> Problem:
 def _snake(joints: int) -> Problem:
     """Return a snake of universal joints that leans over between three cubes; that of 30 joints is 4 m long.
 
-    Links of longer ones are as long. Cubes stand beside the same parts of their length, and the tip moves as far.
+    Links of longer ones are as long, and every tenth joint is a station. Cubes stand beside the same parts of their
+    length, and the tip moves as far.
     """
-    cubes = (((1.3, -0.2, 1.7), 0.6, 0.65), ((-0.7, -0.6, 1.5), 0.5, 0.33), ((0.3, 1.2, 3.0), 0.5, 0.56))
+    cubes = (((1.3, -0.2, 1.7), 0.6, 0.7), ((-0.7, -0.6, 1.5), 0.5, 0.33), ((0.3, 1.2, 3.0), 0.5, 0.56))
     short, home = _snake_at_home(_SNAKES[0]), _snake_at_home(joints)
 
     def beside(part: float, place: Sequence[float]) -> list[float]:
@@ -191,7 +192,8 @@ def _snake(joints: int) -> Problem:
 
 
 def _snake_table(joints: int) -> dict[str, Any]:
-    return snake(joints // 2, length=4.0 * joints / _SNAKES[0])
+    short = _SNAKES[0]
+    return snake(joints // 2, length=4.0 * joints / short) | ({} if joints == short else {"every": 10})
 
 
 def _along(points: Array, part: float) -> Array:
