@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 import vgtm_qp as vq
+from vgtm_qp.bench.between import least_by_resolver, least_by_walker
 from vgtm_qp.bench.contestants import make_baseline
 from vgtm_qp.bench.peers import JointScene, MinkStep, PinkStep, mjcf
 from vgtm_qp.bench.scenes import make_scenes
-from vgtm_qp.bench.tour import make_goals
+from vgtm_qp.bench.tour import Goal, make_goals
 
 PEERS = {"mink": MinkStep, "pink": PinkStep}
 
@@ -110,6 +111,38 @@ def test_a_peer_stands_where_it_is_placed_and_reaches_goals_within_its_limits(
         assert np.all(np.abs(peer.reached - q) <= scene.arm.rate * scene.setup.dt + 1e-9)
         assert np.all((peer.reached >= scene.arm.stroke[:, 0]) & (peer.reached <= scene.arm.stroke[:, 1]))
         q = peer.reached
+
+
+def test_what_comes_near_between_steps_counts(problem: vq.Problem) -> None:
+    resolver = vq.Resolver(problem)
+    setup, goals = resolver.setup, make_goals(problem, resolver)
+    home = setup.arm.home_configuration
+
+    class Sweeping:
+        """Turns its first joint beyond the cube in one step, and back in the next."""
+
+        turn = 0.0
+
+        @property
+        def configuration(self) -> np.ndarray:
+            return home + self.turn * np.eye(len(home))[0]
+
+        def place(self, state: vq.State) -> None:
+            self.turn = 0.0
+
+        def step(self, goal: Goal) -> bool:
+            self.turn = 1.6 - self.turn
+            return True
+
+    def least_at(q: np.ndarray) -> float:
+        return float(setup.monitor.least(setup.arm.points(q), among="obstacles")[0])
+
+    found = least_by_walker(setup, goals[:3], Sweeping())
+    ends = [least_at(home), least_at(home + 1.6 * np.eye(len(home))[0])]
+    between = [least_at(home + turn * np.eye(len(home))[0]) for turn in np.linspace(0.0, 1.6, 21)]
+    assert found == pytest.approx(min(between), abs=1e-9)
+    assert found < min(ends) - 0.03
+    assert least_by_resolver(resolver, goals) >= setup.safe - 1e-9
 
 
 @pytest.mark.parametrize("name", list(PEERS))

@@ -1,4 +1,4 @@
-/* The step of a short arm in one call: condense, solve, check, settle.
+/* The step of a short arm, or of one in joint space, in one call: condense, solve, check, settle.
 
    Every formula of the arm and its curve is a function that CasADi generates; here are the loops and the dense algebra
    between them. A Fused belongs to one resolver: nothing is static, so that threads with a resolver each are safe.
