@@ -204,7 +204,7 @@ def _along(points: Array, part: float) -> Array:
 def _snake_at_home(joints: int) -> Array:
     """Return (J / 2 + 1, 3) universal joints and tip of a snake at home, m."""
     table = ArmTable.model_validate(_snake_table(joints))
-    return SerialChain.of(table).at(np.array([*table.home_values(), *[0.0] * 6]))[0][1 : joints + 2 : 2]
+    return SerialChain.of(table, []).at(np.array([*table.home_values(), *[0.0] * 6]))[0][1 : joints + 2 : 2]
 
 
 def _problem(kind: SceneKind, bays: int) -> Problem:
