@@ -113,7 +113,6 @@ class SegmentGroup:
         self, layout: Layout, segments: Sequence[Segment], kinematics: Kinematics | SegmentKinematics
     ) -> None:
         truss, one = truss_of(layout.arm), segments[0]
-        self.is_square = one.is_square
         self.numbers = np.array([segment.number for segment in segments])
         self._tracks, self._kinematics = one.tracks, kinematics
         self._fixed = np.stack([segment.fixed for segment in segments])

@@ -66,7 +66,7 @@ class CurveMotion:
         gains = method.gains
         self._terms = {name: float(getattr(gains, name)) for name in names}
         self._weights = family.weights(self.s)
-        self._spacing = np.linalg.norm(np.diff(self._weights @ setup.control_vertices, axis=0), axis=1)
+        self._spacing = steps
         vertices = spec.control_vertices
         second = np.diff(np.eye(vertices), n=2, axis=0) if vertices > 2 else np.zeros((0, vertices))
         self._bending = np.kron(second.T @ second, np.eye(3))
@@ -137,7 +137,7 @@ class CurveMotion:
             gradient[:vertices] += gain * rows.T @ (lengths - self._spacing)
         if gain := self._terms.get("smoothness"):
             hessian[:vertices, :vertices] += gain * self._bending
-            gradient[:vertices] += gain * self._bending @ p.ravel()
+            gradient[:vertices] += gain * self._bending @ (p - self.home.control_vertices).ravel()
         if gain := self._terms.get("obstacle_potential"):
             rows, distance = self._near(curve, q, time)
             gain *= area

@@ -47,7 +47,6 @@ class JointGroup:
 
     def __init__(self, arm: JointSegments, segments: Sequence[Segment]) -> None:
         one = segments[0]
-        self.is_square = one.is_square
         self.numbers = np.array([segment.number for segment in segments])
         self.columns = np.array([segment.start for segment in segments])[:, None] + np.arange(one.columns)
         self._arm, self._tracks = arm, one.tracks

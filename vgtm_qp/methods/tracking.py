@@ -13,8 +13,6 @@ from vgtm_qp.methods.assembly import CurveNodes
 from vgtm_qp.methods.resolver import LENGTH_TOLERANCE, MAX_CORRECTIONS
 from vgtm_qp.methods.segments import Segment
 
-_STILL = 1e-11
-
 
 class Group(Protocol):
     """The equations of K segments of one shape, stacked: r rows over c own coordinates and b before them.
@@ -24,7 +22,6 @@ class Group(Protocol):
 
     numbers: Index
     columns: Index
-    is_square: bool
 
     def matrices(self) -> tuple[Array, Array]:
         """Return the derivatives by own coordinates (K, r, c) and by those from ``Segment.first`` on (K, r, b)."""
@@ -60,11 +57,11 @@ class SegmentedArm(Protocol):
 class Tracker:
     """Moves an arm so that its segments meet the curve nodes.
 
-    A segment with more motions than equations moves by the least sum of squares of its coordinates'
-    displacements over the step; the others have one answer. Recursive and parallel tracking solve the same
-    equations. *Recursive* converges each segment before the next. *Parallel* factorises all segments at once
-    at the present configuration, and a chain of small products gives the effect of each on the next (block
-    condensation).
+    A segment with more motions than equations moves by the least displacements of its coordinates to first
+    order: in the row space of its matrix at the start of the step, where its answer is unique. Recursive and
+    parallel tracking solve the same equations. *Recursive* converges each segment before the next. *Parallel*
+    factorises all segments at once at the present configuration, and a chain of small products gives the
+    effect of each on the next (block condensation).
     """
 
     def __init__(self, arm: SegmentedArm, segments: Sequence[Segment], *, parallel: bool) -> None:
@@ -86,10 +83,10 @@ class Tracker:
         SolverError
             A segment is in a singular pose.
         """
-        step, still = np.zeros((2, self._arm.coordinates))
+        step = np.zeros(self._arm.coordinates)
         for chain in self._chains:
             chain.evaluate(q)
-            chain.solve([group.displacements(moved, turned) for group in chain.groups], still, step)
+            chain.solve([group.displacements(moved, turned) for group in chain.groups], step, chain.rows())
         q = np.array(q)
         self._arm.move(q, slice(0, len(step)), step)
         return q
@@ -97,8 +94,7 @@ class Tracker:
     def track(self, q: Array, nodes: CurveNodes) -> Array:
         """Return the configuration with end stations at the curve nodes and exact fixed lengths, by Newton from `q`.
 
-        The Jacobian is that of eq. (39). A step of a segment with spare motions is A^+ (residual + A t) - t, with t its
-        displacement from `X` so far. Its fixed point is the least displacement, whatever the iterates are.
+        The Jacobian is that of eq. (39).
 
         Raises
         ------
@@ -118,23 +114,21 @@ class Tracker:
         # The first step starts at the old configuration of the segments before, and has their displacement as
         # input.
         at, step[chain.before] = start, travelled[chain.before]
+        chain.evaluate(at)
+        within = chain.rows()
         for _ in range(MAX_CORRECTIONS + 1):
-            chain.evaluate(at)
             residuals = [group.residuals(at, nodes) for group in chain.groups]
             is_met = all(float(np.abs(residual).max()) <= LENGTH_TOLERANCE for residual in residuals)
-            is_met = is_met and not step[chain.before].any()
-            if is_met and chain.is_square:
+            if is_met and not step[chain.before].any():
                 return
-            chain.solve(residuals, travelled, step)
+            chain.solve(residuals, step, within)
             own = step[chain.own]
-            largest = float(np.abs(own).max())
-            if is_met and largest <= _STILL:
-                return
-            if not largest <= self._arm.furthest:
+            if not float(np.abs(own).max()) <= self._arm.furthest:
                 raise SolverError(chain.failure.format("diverges"))
             travelled[chain.own] += own
             self._arm.move(q, chain.own, own)
             at, step[chain.before] = q, 0.0
+            chain.evaluate(at)
         raise SolverError(chain.failure.format("does not converge"))
 
 
@@ -152,35 +146,35 @@ class _Chain:
         self._on_others = [segment for segment in segments if segment.first < segment.start]
         self.evaluate, self.groups = arm.equations(segments)
         self.failure = failure
-        self.is_square = all(group.is_square for group in self.groups)
         self.own = slice(segments[0].start, segments[-1].end)
         self.before = slice(segments[0].first, segments[0].start)
 
-    def solve(self, right: list[Array], travelled: Array, step: Array) -> None:
-        """Overwrite the own columns of `step` with the solution of all segments, given the columns before them."""
+    def rows(self) -> list[Array]:
+        """Return the derivatives (K, r, c) of each group's equations by own coordinates, where they were evaluated."""
+        return [group.matrices()[0] for group in self.groups]
+
+    def solve(self, right: list[Array], step: Array, within: list[Array]) -> None:
+        """Overwrite the own coordinates of `step` with the solution of all segments, given the coordinates before them.
+
+        Those of each segment are in the row space of `within` (K, r, c).
+        """
         passed: dict[int, Array] = {}
-        for group, rhs in zip(self.groups, right, strict=True):
+        for group, rhs, rows in zip(self.groups, right, within, strict=True):
             own, before = group.matrices()
-            total = rhs[:, :, None]
-            if not group.is_square:
-                total = total + own @ travelled[group.columns][:, :, None]
-            answers = _least_norm(own, np.concatenate([total, before], axis=2))
+            answers = _solution(own, np.concatenate([rhs[:, :, None], before], axis=2), rows)
             step[group.columns] = answers[:, :, 0]
-            if not group.is_square:
-                step[group.columns] -= travelled[group.columns]
             passed |= zip(group.numbers.tolist(), answers[:, :, 1:], strict=True)
         for segment in self._on_others:
             passes = passed[segment.number][:, : segment.start - segment.first]
             step[segment.start : segment.end] -= passes @ step[segment.first : segment.start]
 
 
-def _least_norm(A: Array, b: Array) -> Array:
-    """Return the solutions of A x = b, or those of least norm where A (K, r, c) has more columns than rows."""
-    rows, columns = A.shape[1:]
+def _solution(A: Array, b: Array, within: Array) -> Array:
+    """Return the solutions (K, c, n) of A x = b in the row space of `within`, which is shaped as A (K, r, c)."""
     try:
-        if rows == columns:
+        if A.shape[1] == A.shape[2]:
             return np.asarray(np.linalg.solve(A, b))
-        At = np.swapaxes(A, 1, 2)
-        return np.asarray(At @ np.linalg.solve(A @ At, b))
+        columns = np.swapaxes(within, 1, 2)
+        return np.asarray(columns @ np.linalg.solve(A @ columns, b))
     except np.linalg.LinAlgError:
         raise SolverError("tracking: a segment is in a singular pose") from None
