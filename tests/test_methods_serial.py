@@ -159,9 +159,3 @@ def test_the_potentials_gradient_by_nodes_is_that_by_the_configuration(name: str
         h = 1e-6
         slope = (potential(q + h * direction) - potential(q - h * direction)) / (2.0 * h)
         assert slope == pytest.approx(float(np.sum(gradient[arm.free] * moved)), rel=1e-4, abs=1e-4)
-
-
-def test_the_curve_first_is_refused_with_what_serves_a_serial_arm() -> None:
-    problem = vq.load_problem("snake_past_a_cube")
-    with pytest.raises(vq.ProblemError, match=r'method\.name: .*"qp" or "pseudoinverse"'):
-        problem.replace({"method.name": "curve-pseudoinverse"})

@@ -21,6 +21,9 @@ ROWS = {"position": 3, "pointing": 5, "orientation": 6}
 _JOINED = 3
 """Bays of a segment that turns its end face: one or two straight octahedral bays would also move it."""
 
+_WEAKEST = 0.01
+"""Least ratio of singular values of a segment's joints: nearly straight links would need more for any stretch."""
+
 _BENDS, _NOTHING = 0.1, 1e-9
 """Mean turn of joints from home, rad, and derivative of a node's position below which a joint does not move it."""
 
@@ -33,6 +36,8 @@ class Segment:
 
     Attributes
     ----------
+    name : str
+        Its bays or joints, as messages call them.
     number : int
         Place among the segments, from the base on.
     station : int
@@ -47,6 +52,7 @@ class Segment:
         Fixed members whose last node it places.
     """
 
+    name: str
     number: int
     station: int
     tracks: str
@@ -125,10 +131,11 @@ def _bay_segments(layout: Layout, partition: list[tuple[int, str]]) -> list[Segm
         columns = layout.node_column[touched]
         start = int(layout.node_column[nodes].min(initial=layout.node_columns))
         first = int(np.min(columns[columns >= 0], initial=start))
-        segment = Segment(len(segments), face, tracks, start, 3 * len(nodes), min(first, start), members)
+        name, count = f"bays up to face {face}", 3 * len(nodes)
+        segment = Segment(name, len(segments), face, tracks, start, count, min(first, start), members)
         if segment.rows > segment.columns:
             raise CurveError(
-                f"the bays up to face {face} have {segment.columns - len(members)} free motions and cannot track "
+                f"the {name} have {segment.columns - len(members)} free motions and cannot track "
                 f"{ROWS[tracks]} coordinates"
             )
         segments.append(segment)
@@ -140,8 +147,9 @@ def _joint_segments(arm: JointSpaceArm, kinematics: Kinematics, turns: str | Non
     """Yield the segments of an arm in joint space: few joints each, as many as their station needs at home.
 
     All track positions; the last one tracks the end effector's turns too. A station ends a segment if the joints
-    from the station before can move it in every direction, and if no joint before it follows one beyond it. Joints
-    of other stations belong to the next segment. The last segment grows towards the base until it can do its part.
+    beyond the segment before can move it well in every direction, and if no joint before it follows one beyond it.
+    Joints of other stations belong to the next segment. The last segment grows towards the base until it can do its
+    part.
 
     Raises
     ------
@@ -160,22 +168,32 @@ def _joint_segments(arm: JointSpaceArm, kinematics: Kinematics, turns: str | Non
         # If joints in between do not move it, a joint before the station follows one beyond.
         end = int(np.count_nonzero(moving[k]))
         is_whole = bool(moving[k, :end].all())
-        if is_whole and has_full_rank(by_joints[arm.stations.nodes[k, 0]][:, starts[-1] : end]):
+        if is_whole and _moves_well(by_joints[arm.stations.nodes[k, 0]][:, starts[-1] : end]):
             stations.append(k)
             starts.append(end)
     tracks = turns or "position"
     rows = tip_rows(arm, kinematics, by_joints, tracks)
-    while not has_full_rank(rows[:, starts[-1] :]):
-        if not stations:
-            raise CurveError(
-                f"the joints cannot move the {ROWS[tracks]} tracked coordinates of the tip independently at home"
-            )
+    rows[3:] *= arm.unit
+    if not has_full_rank(rows):
+        raise CurveError(
+            f"the joints cannot move the {ROWS[tracks]} tracked coordinates of the tip independently at home"
+        )
+    while stations and not _moves_well(rows[:, starts[-1] :]):
         stations.pop()
         starts.pop()
     kinds = ["position"] * len(stations) + [tracks]
+    names = [arm.node_names[k] for k in arm.stations.nodes[:, 0]]
     ends = [*starts[1:], len(arm.actuators)]
     for number, (k, kind, start, end) in enumerate(zip([*stations, last], kinds, starts, ends, strict=True)):
-        yield Segment(number, k, kind, start, end - start)
+        yield Segment(f"joints up to {names[k]}", number, k, kind, start, end - start)
+
+
+def _moves_well(rows: Array) -> bool:
+    """Whether the joints of a Jacobian (r, c) can move all r coordinates, none with much greater turns than another."""
+    if rows.shape[1] < len(rows):
+        return False
+    values = np.linalg.svd(rows, compute_uv=False)
+    return bool(values[-1] > _WEAKEST * values[0])
 
 
 def moved_by_joints(arm: JointSpaceArm, kinematics: Kinematics) -> Array:

@@ -67,10 +67,10 @@ class Tracker:
     def __init__(self, arm: SegmentedArm, segments: Sequence[Segment], *, parallel: bool) -> None:
         self.segments, self._arm = segments, arm
         if parallel:
-            self._chains = [_Chain(arm, segments, "tracking: Newton's method on all segments at once {}")]
+            self._chains = [_Chain(arm, segments, "tracking: Newton's method {} for all segments at once")]
             return
-        failure = "tracking: Newton's method {{}} in the segment that ends at station {}"
-        self._chains = [_Chain(arm, [one], failure.format(one.station)) for one in segments]
+        failure = "tracking: Newton's method {{}} for the {}"
+        self._chains = [_Chain(arm, [one], failure.format(one.name)) for one in segments]
 
     def rates(self, q: Array, moved: Array, turned: Array) -> Array:
         """Return the configuration after a step from `q` that follows the curve nodes to first order.
