@@ -107,7 +107,7 @@ class BaySegments:
 
 
 class SegmentGroup:
-    """The equations of K segments of one shape, stacked: see ``tracking.Group``."""
+    """The equations of K segments of one shape, stacked: see ``tracking.SegmentEquations``."""
 
     def __init__(
         self, layout: Layout, segments: Sequence[Segment], kinematics: Kinematics | SegmentKinematics

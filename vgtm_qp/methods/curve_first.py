@@ -63,8 +63,17 @@ class CurveFirstResolver(MethodResolver, serves="curve-pseudoinverse"):
             else BaySegments(layout, kinematics)
         )
         self.tracker = Tracker(in_segments, segments, parallel=method.tracking == "parallel")
-        self._s = self.motion.s[[segment.station for segment in segments]]
-        self._weights = self.motion.home.family.weights(self._s)
+        tracked = np.array([segment.station for segment in segments])
+        self._s, family, shape = self.motion.s[tracked], self.motion.home.family, layout.shape
+        self._weights = family.weights(self._s)
+        assert shape is not None, "the motion of the curve has its family"
+        # Gaps are measured where the segments end.
+        shape = replace(shape, nodes=self._s, roll=None, tracks_roll=False, spacing=None)
+        slopes = family.weights(self._s, 1)
+        layout = replace(
+            layout, tracked=tracked, shape=shape, curve_weights=self._weights, curve_slopes=slopes
+        )
+        self._setup = replace(setup, layout=layout)
         self._frames = any(segment.tracks != "position" for segment in segments)
         self._correct = method.correct
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from vgtm_qp.arrays import Array
+from vgtm_qp.curve.closest import closest_to_point
 from vgtm_qp.curve.curve import Curve
 from vgtm_qp.curve.redundancy import BASE_ROWS, degree_of_redundancy
 from vgtm_qp.errors import SolverError
@@ -25,8 +26,9 @@ _SAMPLES = 400
 
 
 class CurveMotion:
-    """Moves a reference curve so that its end follows the path; its nodes are at `s` (F,), one a station.
+    """Moves a reference curve so that its end follows the path.
 
+    Its nodes are at the parameters `s` (F,), one a station: at home the nearest points of the curve to the stations.
     The frame of its end times the constant rotation `roll` (3, 3) is that of the end effector: at home they agree.
 
     Raises
@@ -52,9 +54,9 @@ class CurveMotion:
         if mistakes:
             raise problem.error(mistakes)
         centres, base = arm.stations.centres(arm.home), arm.stations.frames[0]
-        steps = np.linalg.norm(np.diff(centres, axis=0), axis=1)
-        self.s = np.concatenate([[0.0], np.cumsum(steps)]) / steps.sum()
         self.home = Curve(family, setup.control_vertices, np.zeros(spec.torsion_vertices), base)
+        between = [float(closest_to_point(self.home, centre).s[0]) for centre in centres[1:-1]]
+        self.s = np.array([0.0, *between, 1.0])
         self.roll = np.eye(3)
         if setup.task.turns == "orientation":
             x = arm.end_effector.frame[:, 0] @ self.home.frame(1.0)
@@ -66,7 +68,7 @@ class CurveMotion:
         gains = method.gains
         self._terms = {name: float(getattr(gains, name)) for name in names}
         self._weights = family.weights(self.s)
-        self._spacing = steps
+        self._spacing = np.linalg.norm(np.diff(centres, axis=0), axis=1)
         vertices = spec.control_vertices
         second = np.diff(np.eye(vertices), n=2, axis=0) if vertices > 2 else np.zeros((0, vertices))
         self._bending = np.kron(second.T @ second, np.eye(3))

@@ -43,7 +43,7 @@ class JointSegments:
 
 
 class JointGroup:
-    """The equations of K segments of one shape, stacked: see ``tracking.Group``."""
+    """The equations of K segments of one shape, stacked: see ``tracking.SegmentEquations``."""
 
     def __init__(self, arm: JointSegments, segments: Sequence[Segment]) -> None:
         one = segments[0]
@@ -56,7 +56,7 @@ class JointGroup:
         self._nodes, self._weights = stations.nodes[numbers], stations.weights[numbers]
 
     def matrices(self) -> tuple[Array, Array]:
-        """See ``tracking.Group``; columns beyond those before a segment are without meaning."""
+        """See ``tracking.SegmentEquations``; columns beyond those before a segment are without meaning."""
         arm = self._arm
         if self._tracks == "position":
             rows = np.einsum("kp,kpcj->kcj", self._weights, arm.by_joints[self._nodes])
@@ -67,11 +67,11 @@ class JointGroup:
         return own, rows[:, :, : self._before]
 
     def displacements(self, moved: Array, turned: Array) -> Array:
-        """See ``tracking.Group``."""
+        """See ``tracking.SegmentEquations``."""
         return station_motions(self._tracks, self._frames, moved[self.numbers], turned[self.numbers])
 
     def residuals(self, q: Array, nodes: CurveNodes) -> Array:
-        """See ``tracking.Group``."""
+        """See ``tracking.SegmentEquations``."""
         X = self._arm.arm.nodes(q)
         centres = np.einsum("kp,kpc->kc", self._weights, X[self._nodes])
         return station_gaps(self._tracks, centres, self._frames, nodes.of(self.numbers))

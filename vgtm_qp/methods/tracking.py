@@ -14,7 +14,7 @@ from vgtm_qp.methods.resolver import LENGTH_TOLERANCE, MAX_CORRECTIONS
 from vgtm_qp.methods.segments import Segment
 
 
-class Group(Protocol):
+class SegmentEquations(Protocol):
     """The equations of K segments of one shape, stacked: r rows over c own coordinates and b before them.
 
     ``numbers`` (K,) are those of the segments; ``columns`` (K, c) are their own coordinates.
@@ -45,7 +45,9 @@ class SegmentedArm(Protocol):
     coordinates: int
     furthest: float
 
-    def equations(self, segments: Sequence[Segment]) -> tuple[Callable[[Array], None], Sequence[Group]]:
+    def equations(
+        self, segments: Sequence[Segment]
+    ) -> tuple[Callable[[Array], None], Sequence[SegmentEquations]]:
         """Return what evaluates the equations of some segments at a configuration, and the equations in groups."""
         ...
 
@@ -67,7 +69,7 @@ class Tracker:
     def __init__(self, arm: SegmentedArm, segments: Sequence[Segment], *, parallel: bool) -> None:
         self.segments, self._arm = segments, arm
         if parallel:
-            self._chains = [_Chain(arm, segments, "tracking: Newton's method {} for all segments at once")]
+            self._chains = [_Chain(arm, segments, "tracking: Newton's method on all segments at once {}")]
             return
         failure = "tracking: Newton's method {{}} for the {}"
         self._chains = [_Chain(arm, [one], failure.format(one.name)) for one in segments]
