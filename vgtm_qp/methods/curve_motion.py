@@ -169,12 +169,11 @@ class CurveMotion:
         setup = self._setup
         pairs = setup.monitor.near(setup.carrier.points(q), time, setup.influence)
         # What the arm carries has no place on the curve.
-        with_obstacle = np.flatnonzero(~pairs.is_self & (pairs.body < len(setup.arm.bodies)))
-        first, last = setup.arm.bodies.points[pairs.body[with_obstacle]].T
-        t, normal = pairs.weights[with_obstacle, 1], pairs.normal[with_obstacle]
-        s = np.clip((1.0 - t) * self._point_s[first] + t * self._point_s[last], 0.0, 1.0)
-        points = setup.arm.points(q)
-        witness = (1.0 - t)[:, None] * points[first] + t[:, None] * points[last]
+        kept = np.flatnonzero(~pairs.is_self & (pairs.body < len(setup.arm.bodies)))
+        # The weights of the obstacle's points are zero.
+        spanned, weights, normal = pairs.points[kept], pairs.weights[kept], pairs.normal[kept]
+        s = np.clip(np.einsum("rk,rk->r", weights, self._point_s[spanned]), 0.0, 1.0)
+        witness = np.einsum("rk,rkc->rc", weights, setup.arm.points(q)[spanned])
         slopes = curve.derivative(s)
         length = np.linalg.norm(slopes, axis=1, keepdims=True)
         tangent = slopes / length
@@ -184,7 +183,7 @@ class CurveMotion:
         table, slope = curve.family.weights(s), curve.family.weights(s, 1)
         across = (turning - np.einsum("rc,rc->r", turning, tangent)[:, None] * tangent) / length
         rows = np.einsum("rv,rc->rvc", table, normal) + np.einsum("rv,rc->rvc", slope, across)
-        return rows.reshape(len(s), 3 * table.shape[1]), pairs.distance[with_obstacle]
+        return rows.reshape(len(s), 3 * table.shape[1]), pairs.distance[kept]
 
 
 def displaced(curve: Curve, d: Array) -> Curve:
