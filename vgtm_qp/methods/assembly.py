@@ -194,6 +194,8 @@ def station_gaps(tracks: str, centres: Array, frames: Array, nodes: CurveNodes) 
 
 def station_motions(tracks: str, frames: Array, moved: Array, turned: Array) -> Array:
     """Return (K, 3 + t) the tracked coordinates of displacements `moved`, m, and rotation vectors `turned`, rad."""
+    if tracks == "position":
+        return moved
     return np.concatenate([moved, tracked_turns(tracks, frames, turned[:, :, None])[:, :, 0]], axis=1)
 
 

@@ -88,7 +88,7 @@ class Tracker:
         step = np.zeros(self._arm.coordinates)
         for chain in self._chains:
             chain.evaluate(q)
-            chain.solve([group.displacements(moved, turned) for group in chain.groups], step, chain.rows())
+            chain.solve([group.displacements(moved, turned) for group in chain.groups], step)
         q = np.array(q)
         self._arm.move(q, slice(0, len(step)), step)
         return q
@@ -116,21 +116,20 @@ class Tracker:
         # The first step starts at the old configuration of the segments before, and has their displacement as
         # input.
         at, step[chain.before] = start, travelled[chain.before]
-        chain.evaluate(at)
-        within = chain.rows()
+        within = None
         for _ in range(MAX_CORRECTIONS + 1):
+            chain.evaluate(at)
             residuals = [group.residuals(at, nodes) for group in chain.groups]
             is_met = all(float(np.abs(residual).max()) <= LENGTH_TOLERANCE for residual in residuals)
             if is_met and not step[chain.before].any():
                 return
-            chain.solve(residuals, step, within)
+            within = chain.solve(residuals, step, within)
             own = step[chain.own]
             if not float(np.abs(own).max()) <= self._arm.furthest:
                 raise SolverError(chain.failure.format("diverges"))
             travelled[chain.own] += own
             self._arm.move(q, chain.own, own)
             at, step[chain.before] = q, 0.0
-            chain.evaluate(at)
         raise SolverError(chain.failure.format("does not converge"))
 
 
@@ -151,24 +150,23 @@ class _Chain:
         self.own = slice(segments[0].start, segments[-1].end)
         self.before = slice(segments[0].first, segments[0].start)
 
-    def rows(self) -> list[Array]:
-        """Return the derivatives (K, r, c) of each group's equations by own coordinates, where they were evaluated."""
-        return [group.matrices()[0] for group in self.groups]
-
-    def solve(self, right: list[Array], step: Array, within: list[Array]) -> None:
+    def solve(self, right: list[Array], step: Array, within: list[Array] | None = None) -> list[Array]:
         """Overwrite the own coordinates of `step` with the solution of all segments, given the coordinates before them.
 
-        Those of each segment are in the row space of `within` (K, r, c).
+        Those of each segment are in the row space of `within`, matrices (K, r, c) of each group; by default of
+        the present ones. Returns these matrices.
         """
         passed: dict[int, Array] = {}
-        for group, rhs, rows in zip(self.groups, right, within, strict=True):
-            own, before = group.matrices()
+        matrices = [group.matrices() for group in self.groups]
+        within = within or [own for own, _ in matrices]
+        for group, (own, before), rhs, rows in zip(self.groups, matrices, right, within, strict=True):
             answers = _solution(own, np.concatenate([rhs[:, :, None], before], axis=2), rows)
             step[group.columns] = answers[:, :, 0]
             passed |= zip(group.numbers.tolist(), answers[:, :, 1:], strict=True)
         for segment in self._on_others:
             passes = passed[segment.number][:, : segment.start - segment.first]
             step[segment.start : segment.end] -= passes @ step[segment.first : segment.start]
+        return within
 
 
 def _solution(A: Array, b: Array, within: Array) -> Array:
