@@ -298,6 +298,11 @@ def test_every_preset_moves_a_snake_along_its_path(name: str) -> None:
     assert maneuver.arrived, maneuver.blocked_by
     off = np.linalg.norm(maneuver.tip_position - maneuver.tip_target_position, axis=1).max()
     assert off < (1e-9 if problem.method.correct else 0.1)
+    certificate = maneuver.certificate
+    assert certificate is not None
+    assert not certificate.contradictions
+    assert certificate.tracking_gap.value is not None
+    assert certificate.tracking_gap.value < (1e-10 if problem.method.correct else 0.1)
 
 
 @pytest.mark.parametrize(

@@ -57,23 +57,23 @@ class CurveFirstResolver(MethodResolver, serves="curve-pseudoinverse"):
         arm, kinematics, layout = setup.arm, setup.kinematics, setup.layout
         with problem.blaming(("method", "name"), '"qp", or an arm whose every segment can follow the curve'):
             segments = make_segments(layout, kinematics, setup.task.turns)
-        in_segments: SegmentedArm = (
-            JointSegments(arm, kinematics)
-            if isinstance(arm, JointSpaceArm)
-            else BaySegments(layout, kinematics)
-        )
-        self.tracker = Tracker(in_segments, segments, parallel=method.tracking == "parallel")
         tracked = np.array([segment.station for segment in segments])
         self._s, family, shape = self.motion.s[tracked], self.motion.home.family, layout.shape
         self._weights = family.weights(self._s)
-        assert shape is not None, "the motion of the curve has its family"
-        # Gaps are measured where the segments end.
-        shape = replace(shape, nodes=self._s, roll=None, tracks_roll=False, spacing=None)
-        slopes = family.weights(self._s, 1)
-        layout = replace(
-            layout, tracked=tracked, shape=shape, curve_weights=self._weights, curve_slopes=slopes
-        )
-        self._setup = replace(setup, layout=layout)
+        in_segments: SegmentedArm
+        if isinstance(arm, JointSpaceArm):
+            in_segments = JointSegments(arm, kinematics)
+            # Gaps are measured where the segments end.
+            assert shape is not None, "the motion of the curve has its family"
+            shape = replace(shape, nodes=self._s, roll=None, tracks_roll=False, spacing=None)
+            slopes = family.weights(self._s, 1)
+            layout = replace(
+                layout, curve_weights=self._weights, curve_slopes=slopes, tracked=tracked, shape=shape
+            )
+            self._setup = replace(setup, layout=layout)
+        else:
+            in_segments = BaySegments(layout, kinematics)
+        self.tracker = Tracker(in_segments, segments, parallel=method.tracking == "parallel")
         self._frames = any(segment.tracks != "position" for segment in segments)
         self._correct = method.correct
 

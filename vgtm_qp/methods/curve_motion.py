@@ -56,7 +56,7 @@ class CurveMotion:
         centres, base = arm.stations.centres(arm.home), arm.stations.frames[0]
         self.home = Curve(family, setup.control_vertices, np.zeros(spec.torsion_vertices), base)
         between = [float(closest_to_point(self.home, centre).s[0]) for centre in centres[1:-1]]
-        self.s = np.array([0.0, *between, 1.0])
+        self.s = np.maximum.accumulate([0.0, *between, 1.0])
         self.roll = np.eye(3)
         if setup.task.turns == "orientation":
             x = arm.end_effector.frame[:, 0] @ self.home.frame(1.0)
