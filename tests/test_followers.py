@@ -83,7 +83,9 @@ def test_followers_keep_to_what_they_follow(maneuver):
     assert "yaw-3" not in maneuver.actuator_names
 
 
-@pytest.mark.parametrize("method", ["pseudoinverse", "pseudoinverse-corrected", "qp-none"])
+@pytest.mark.parametrize(
+    "method", ["pseudoinverse", "pseudoinverse-corrected", "qp-none", "curve-pseudoinverse"]
+)
 def test_every_method_moves_followers(method):
     found = vq.solve(with_method(problem(), method))
     joints = dict(zip(found.joint_names.tolist(), found.joints.T, strict=True))

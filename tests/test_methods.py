@@ -128,8 +128,9 @@ def test_damping_and_truncation_change_the_answer_and_the_rank() -> None:
 def test_segments_are_of_the_right_size() -> None:
     def partition(module: str, turns: str | None = None, **truss: object) -> list[tuple[int, str, bool]]:
         problem = free_problem(module).replace({f"truss.{key}": value for key, value in truss.items()})
-        layout = build_arm(problem.replace({"method.solver": "piqp"})).layout
-        return [(s.face, s.tracks, s.is_square) for s in make_segments(layout, turns)]
+        setup = build_arm(problem.replace({"method.solver": "piqp"}))
+        segments = make_segments(setup.layout, setup.kinematics, turns)
+        return [(s.station, s.tracks, s.is_square) for s in segments]
 
     assert partition("octahedral") == [(k, "position", True) for k in range(1, 6)]
     assert partition("hexapod") == [(k, "orientation", True) for k in range(1, 5)]

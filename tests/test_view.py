@@ -151,7 +151,8 @@ def test_the_hand_offers_the_methods_that_the_command_takes_whatever_the_problem
 def test_a_serial_arm_is_offered_what_can_move_it():
     served = list(methods_for(vq.load_problem("snake_past_a_cube")))
     assert served[:3] == ["qp", "qp-osqp", "qp-none"]
-    assert {name.partition("-")[0] for name in served} == {"qp", "pseudoinverse"}
+    assert {name.partition("-")[0] for name in served} == {"qp", "pseudoinverse", "curve"}
+    assert {"qp-recursive", "qp-parallel"}.isdisjoint(served)
 
 
 def test_a_changed_setting_keeps_the_state_and_a_wrong_one_changes_nothing(session: Session):

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from vgtm_qp.comparison.row import INTERRUPTED, Row, make_row
 from vgtm_qp.comparison.tables import markdown_table
-from vgtm_qp.errors import VgtmError
+from vgtm_qp.errors import ProblemError, VgtmError
 from vgtm_qp.machine import machine, sentence
 from vgtm_qp.maneuver.maneuver import Maneuver
 from vgtm_qp.maneuver.solve import compile_steps, solve
@@ -155,7 +155,8 @@ def run_method(
             changed, progress=None if progress is None else lambda part, step: progress(name, part, step)
         )
     except VgtmError as error:
-        reason = str(error).splitlines()[0]
+        # The report names the problem already, and has no room for the path of its file.
+        reason = str(error.mistakes[0] if isinstance(error, ProblemError) else error).splitlines()[0]
         return Row(problem.name, name, False, False, "refused", 0.0, 0, reason), None
     row = make_row(problem.name, name, maneuver)
     if INTERRUPTED in maneuver.blocked_by:

@@ -24,7 +24,7 @@ _LINE, _LETTER = 8.6, 3.6
 _MOST_LINES = 5
 _CURVES, _AXES = 2.35, (1.9, 1.75)
 """Inches: height of the plots at the foot, and the size of one."""
-_FLOOR = 1e-16
+_FLOOR, _LEAST_TOP = 1e-16, 1e-12
 _VERDICTS = {"solved": "#006B4F", "keeps all but drifts": "#9A6700", "failed": BOUND_COLOUR}
 
 
@@ -156,6 +156,8 @@ def _draw_curves(figure: Figure, problems: list[str], pairs: list[tuple[Row, Man
     for one in safe:
         clearance.axhline(one, color=BOUND_COLOUR, linewidth=0.6)
     clearance.set(xlim=(0.0, 1.0), xlabel="part of the path", ylabel="clearance at the states (mm)")
+    # Over less than a few decades ticks have long labels, which do not fit between the plots.
+    drift.set_ylim(top=max(drift.get_ylim()[1], _LEAST_TOP))
     drift.set(xlim=(0.0, 1.0), xlabel="part of the path", ylabel="change of a fixed member (m)")
     handles = [Line2D([], [], label=method, **look) for method, look in styles.items()]
     if len(problems) > 1:

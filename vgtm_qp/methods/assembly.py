@@ -1,9 +1,9 @@
-"""The equations of segments at one configuration: fixed members, and tracked coordinates of end faces, eq. (39)."""
+"""The equations of segments at one configuration: fixed members, and tracked coordinates of end stations, eq. (39)."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import cached_property
+from collections.abc import Callable, Sequence
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +14,7 @@ from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.compiled import Kernel
-from vgtm_qp.methods.segments import Segment
+from vgtm_qp.methods.segments import Segment, tracked_turns
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.rotation import vector_from_rotation
 from vgtm_qp.rows.members import member_function
@@ -25,6 +25,10 @@ class CurveNodes(NamedTuple):
 
     position: Array
     frame: Array
+
+    def of(self, numbers: Index) -> CurveNodes:
+        """Return those of some segments (K,)."""
+        return CurveNodes(self.position.take(numbers, axis=0), self.frame.take(numbers, axis=0))
 
 
 class SegmentKinematics:
@@ -45,7 +49,7 @@ class SegmentKinematics:
 
     def evaluate(self, X: Array, segment: Segment) -> None:
         """Overwrite the values of a segment's fixed members and end face with those at `X` (N, 3), m."""
-        truss, fixed, face = self._truss, segment.fixed, segment.face
+        truss, fixed, face = self._truss, segment.fixed, segment.station
         if len(fixed):
             if len(fixed) not in self._members:
                 member = member_function(has_offsets=truss.joints is not None)
@@ -72,23 +76,48 @@ class SegmentKinematics:
             self.station_spin[face] = self._frame.outputs[1].reshape(9, 3).T
 
 
-class SegmentGroup:
-    """The equations of K segments of one shape, stacked: r rows over c own columns and b columns before them.
+class BaySegments:
+    """The equations of a truss in segments, see ``tracking.SegmentedArm``: coordinates are those of the free nodes.
 
-    ``numbers`` (K,) are those of the segments; ``columns`` (K, c) are the columns of their nodes in the
-    layout.
+    `kinematics` evaluates all segments at once.
     """
+
+    def __init__(self, layout: Layout, kinematics: Kinematics) -> None:
+        self.coordinates = layout.node_columns
+        self.furthest = 2.0 * float(layout.arm.home_quantities.max())
+        self._layout, self._kinematics, self._free = layout, kinematics, layout.arm.free
+        self._single = SegmentKinematics(truss_of(layout.arm))
+
+    def move(self, q: Array, own: slice, d: Array) -> None:
+        """See ``tracking.SegmentedArm``."""
+        q[self._free[own.start // 3 : own.stop // 3]] += d.reshape(-1, 3)
+
+    def equations(self, segments: Sequence[Segment]) -> tuple[Callable[[Array], None], list[SegmentGroup]]:
+        """See ``tracking.SegmentedArm``."""
+        kinematics: Kinematics | SegmentKinematics = self._kinematics
+        evaluate: Callable[[Array], None] = self._kinematics.evaluate
+        if len(segments) == 1:
+            kinematics = self._single
+            evaluate = partial(self._single.evaluate, segment=segments[0])
+        shapes: dict[tuple[int, int, int, str], list[Segment]] = {}
+        for segment in segments:
+            before = segment.start - segment.first
+            shapes.setdefault((segment.rows, segment.columns, before, segment.tracks), []).append(segment)
+        return evaluate, [SegmentGroup(self._layout, alike, kinematics) for alike in shapes.values()]
+
+
+class SegmentGroup:
+    """The equations of K segments of one shape, stacked: see ``tracking.SegmentEquations``."""
 
     def __init__(
         self, layout: Layout, segments: Sequence[Segment], kinematics: Kinematics | SegmentKinematics
     ) -> None:
         truss, one = truss_of(layout.arm), segments[0]
-        self.is_square = one.is_square
         self.numbers = np.array([segment.number for segment in segments])
         self._tracks, self._kinematics = one.tracks, kinematics
         self._fixed = np.stack([segment.fixed for segment in segments])
         self._home, self._still = layout.arm.home_quantities[self._fixed], np.zeros(self._fixed.shape)
-        self._face = np.array([segment.face for segment in segments])
+        self._face = np.array([segment.station for segment in segments])
         self._corners, self._weights = truss.faces[self._face], truss.face_weights[self._face][:, None]
         self._centre_rows = np.repeat(self._weights, 3)
         start = np.array([segment.start for segment in segments])
@@ -127,7 +156,7 @@ class SegmentGroup:
         values = [
             kinematics.gradient.take(self._fixed, axis=0).ravel(),
             self._centre_rows,
-            self._tracked(kinematics.station_spin[self._face]).ravel(),
+            tracked_turns(self._tracks, self._frames, kinematics.station_spin[self._face]).ravel(),
         ]
         flat = np.bincount(self._places, weights=np.concatenate(values), minlength=self._size)
         stacked = flat.reshape(self._shape).astype(np.float64, copy=False)
@@ -135,37 +164,39 @@ class SegmentGroup:
 
     def displacements(self, moved: Array, turned: Array) -> Array:
         """Return the right-hand sides (K, r) for curve nodes that move and turn, (S, 3) each, m and rad."""
-        moved, turned = moved.take(self.numbers, axis=0), turned.take(self.numbers, axis=0)
-        return self._stacked(self._still, moved, turned)
+        wanted = station_motions(self._tracks, self._frames, moved[self.numbers], turned[self.numbers])
+        return np.concatenate([self._still, wanted], axis=1)
 
     def residuals(self, X: Array, nodes: CurveNodes) -> Array:
         """Return (K, r) errors of lengths and of end faces against `nodes`, at the evaluated configuration `X`."""
         lengths = self._home - self._kinematics.quantities.take(self._fixed)
-        gap = (
-            nodes.position.take(self.numbers, axis=0) - (self._weights @ X.take(self._corners, axis=0))[:, 0]
-        )
-        if self._tracks == "position":
-            return np.concatenate([lengths, gap], axis=1)
-        frames, wanted = self._kinematics.station_rotation[self._face], nodes.frame[self.numbers]
-        if self._tracks == "orientation":
-            turn = rotation_vectors(wanted @ np.swapaxes(frames, 1, 2))
-        else:
-            turn = _turns_between(frames[:, :, 2], wanted[:, :, 2])
-        return self._stacked(lengths, gap, turn)
+        centres = (self._weights @ X.take(self._corners, axis=0))[:, 0]
+        gaps = station_gaps(self._tracks, centres, self._frames, nodes.of(self.numbers))
+        return np.concatenate([lengths, gaps], axis=1)
 
-    def _stacked(self, lengths: Array, moved: Array, turned: Array) -> Array:
-        if self._tracks == "position":
-            return np.concatenate([lengths, moved], axis=1)
-        return np.concatenate([lengths, moved, self._tracked(turned[:, :, None])[:, :, 0]], axis=1)
+    @property
+    def _frames(self) -> Array:
+        """(K, 3, 3) frames of the end faces."""
+        return self._kinematics.station_rotation.take(self._face, axis=0)
 
-    def _tracked(self, turns: Array) -> Array:
-        """Return the tracked rows (K, t, n) of turns (K, 3, n): t = 0, 3, or 2 about the face's x and y."""
-        if self._tracks == "position":
-            return turns[:, :0]
-        if self._tracks == "orientation":
-            return turns
-        axes = self._kinematics.station_rotation[self._face][:, :, :2]
-        return np.asarray(np.swapaxes(axes, 1, 2) @ turns)
+
+def station_gaps(tracks: str, centres: Array, frames: Array, nodes: CurveNodes) -> Array:
+    """Return (K, 3 + t) what K stations miss to their curve nodes: positions, m, and tracked turns, rad."""
+    gap = nodes.position - centres
+    if tracks == "position":
+        return gap
+    if tracks == "orientation":
+        turn = rotation_vectors(nodes.frame @ np.swapaxes(frames, 1, 2))
+    else:
+        turn = _turns_between(frames[:, :, 2], nodes.frame[:, :, 2])
+    return station_motions(tracks, frames, gap, turn)
+
+
+def station_motions(tracks: str, frames: Array, moved: Array, turned: Array) -> Array:
+    """Return (K, 3 + t) the tracked coordinates of displacements `moved`, m, and rotation vectors `turned`, rad."""
+    if tracks == "position":
+        return moved
+    return np.concatenate([moved, tracked_turns(tracks, frames, turned[:, :, None])[:, :, 0]], axis=1)
 
 
 def rotation_vectors(rotations: Array) -> Array:

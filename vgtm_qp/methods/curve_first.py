@@ -1,4 +1,4 @@
-"""The paper's method, section 4: the curve first, then the truss tracks it."""
+"""The paper's method, section 4: the curve first, then the arm tracks it."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from vgtm_qp.arm.joint_space import JointSpaceArm
 from vgtm_qp.curve.curve import Curve
-from vgtm_qp.methods.assembly import CurveNodes, rotation_vectors
+from vgtm_qp.methods.assembly import BaySegments, CurveNodes, rotation_vectors
 from vgtm_qp.methods.curve_motion import CurveMotion
+from vgtm_qp.methods.joint_segments import JointSegments
 from vgtm_qp.methods.resolver import MethodResolver, Moved, displacement_to
 from vgtm_qp.methods.segments import make_segments
-from vgtm_qp.methods.tracking import Tracker
+from vgtm_qp.methods.tracking import SegmentedArm, Tracker
 from vgtm_qp.problem import Problem
 from vgtm_qp.qp.terms import Inequality, Objective
 from vgtm_qp.step.build import build_arm
@@ -20,7 +22,7 @@ from vgtm_qp.step.path import Path
 
 
 class CurveFirstResolver(MethodResolver, serves="curve-pseudoinverse"):
-    """Moves the curve by itself, by eqs. (37)-(38), then the truss after it, recursively or in parallel.
+    """Moves the curve by itself, by eqs. (37)-(38), then the arm after it, recursively or in parallel.
 
     Raises
     ------
@@ -39,27 +41,39 @@ class CurveFirstResolver(MethodResolver, serves="curve-pseudoinverse"):
         coupled = problem.replace({"method": method.kept_by("qp", "coupled")})
         super().__init__(build_arm(coupled, solves=False))
         setup, mistakes = self.setup, []
+        table = "truss" if problem.truss is not None else "arm"
         if not setup.layout.vertices:
-            text = (
-                '"qp" or "pseudoinverse": this method moves a curve that faces track, and this arm has none'
-            )
+            text = '"qp" or "pseudoinverse": this method moves a curve that stations track, and this arm has none'
             mistakes.append(problem.mistake(("method", "name"), text))
         if setup.base_motion is not None:
             text = "a base at rest: the methods qp and pseudoinverse know a moving one"
-            mistakes.append(problem.mistake(("truss", "base_motion"), text))
+            mistakes.append(problem.mistake((table, "base_motion"), text))
         if setup.jams:
             text = "no actuator that jams on the way: the methods qp and pseudoinverse hold one"
-            mistakes.append(problem.mistake(("truss", "locked"), text))
+            mistakes.append(problem.mistake((table, "locked"), text))
         if mistakes:
             raise problem.error(mistakes)
         self.motion = CurveMotion(problem, setup)
-        with problem.blaming(("method", "name"), '"qp", or an arm whose every bay can follow the curve'):
-            segments = make_segments(setup.layout, setup.task.turns)
-        self.tracker = Tracker(
-            setup.layout, setup.kinematics, segments, parallel=method.tracking == "parallel"
-        )
-        self._s = self.motion.s[[segment.face for segment in segments]]
-        self._weights = self.motion.home.family.weights(self._s)
+        arm, kinematics, layout = setup.arm, setup.kinematics, setup.layout
+        with problem.blaming(("method", "name"), '"qp", or an arm whose every segment can follow the curve'):
+            segments = make_segments(layout, kinematics, setup.task.turns)
+        tracked = np.array([segment.station for segment in segments])
+        self._s, family, shape = self.motion.s[tracked], self.motion.home.family, layout.shape
+        self._weights = family.weights(self._s)
+        in_segments: SegmentedArm
+        if isinstance(arm, JointSpaceArm):
+            in_segments = JointSegments(arm, kinematics)
+            # Gaps are measured where the segments end.
+            assert shape is not None, "the motion of the curve has its family"
+            shape = replace(shape, nodes=self._s, roll=None, tracks_roll=False, spacing=None)
+            slopes = family.weights(self._s, 1)
+            layout = replace(
+                layout, curve_weights=self._weights, curve_slopes=slopes, tracked=tracked, shape=shape
+            )
+            self._setup = replace(setup, layout=layout)
+        else:
+            in_segments = BaySegments(layout, kinematics)
+        self.tracker = Tracker(in_segments, segments, parallel=method.tracking == "parallel")
         self._frames = any(segment.tracks != "position" for segment in segments)
         self._correct = method.correct
 
@@ -70,26 +84,29 @@ class CurveFirstResolver(MethodResolver, serves="curve-pseudoinverse"):
         return replace(self.motion.home, control_vertices=vertices, torsion=torsion)
 
     def lock(self, name: str) -> None:  # noqa: ARG002
-        """Refuse: a bay with as many rows as motions could not follow the curve with a locked actuator."""
+        """Refuse: a segment with as many rows as motions could not follow the curve with a locked actuator."""
         self._refuse("hold an actuator", '"qp", "pseudoinverse"')
 
     def _move(self, path: Path, start: float, end: float, dt: float) -> Moved:  # noqa: ARG002
         state, before = self.state, self.curve
         goal = displacement_to(path.at(end), path.at(start))
-        curve = self.motion.follow(before, goal, state.time, state.nodes, correct=self._correct)
+        curve = self.motion.follow(before, goal, state.time, state.q, correct=self._correct)
         nodes = self._nodes(curve)
         self._clock.add("solve")
         if self._correct:
-            X = self.tracker.track(state.nodes, nodes)
+            q = self.tracker.track(state.q, nodes)
         else:
             old = self._nodes(before)
             turned = rotation_vectors(nodes.frame @ np.swapaxes(old.frame, 1, 2))
-            X = self.tracker.rates(state.nodes, nodes.position - old.position, turned)
+            q = self.tracker.rates(state.q, nodes.position - old.position, turned)
         self._clock.add("correction")
-        return Moved(X, curve.control_vertices, curve.torsion)
+        return Moved(q, curve.control_vertices, curve.torsion)
 
     def _nodes(self, curve: Curve) -> CurveNodes:
         """Return the curve nodes of the segments; their frames are identities where none is tracked."""
         s = self._s
-        frame = curve.frame(s) if self._frames else np.broadcast_to(np.eye(3), (len(s), 3, 3))
+        frame = np.tile(np.eye(3), (len(s), 1, 1))
+        if self._frames:
+            frame = curve.frame(s)
+            frame[-1] = frame[-1] @ self.motion.roll
         return CurveNodes(self._weights @ curve.control_vertices, frame)

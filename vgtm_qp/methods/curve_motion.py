@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.arrays import Array
+from vgtm_qp.curve.closest import closest_to_point
 from vgtm_qp.curve.curve import Curve
 from vgtm_qp.curve.redundancy import BASE_ROWS, degree_of_redundancy
 from vgtm_qp.errors import SolverError
@@ -15,6 +15,7 @@ from vgtm_qp.methods.objectives import potential_curvature, potential_slope
 from vgtm_qp.methods.pseudoinverse import Cost, moore_penrose, null_space_vector, projector
 from vgtm_qp.methods.resolver import MAX_CORRECTIONS, TIP_TOLERANCE
 from vgtm_qp.problem import Problem
+from vgtm_qp.rotation import rotation_from_vector
 from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.setup import Setup
 
@@ -25,7 +26,10 @@ _SAMPLES = 400
 
 
 class CurveMotion:
-    """Moves a reference curve so that its end follows the path; its nodes are at `s` (F,), one a face.
+    """Moves a reference curve so that its end follows the path.
+
+    Its nodes are at the parameters `s` (F,), one a station: at home the nearest points of the curve to the stations.
+    The frame of its end times the constant rotation `roll` (3, 3) is that of the end effector: at home they agree.
 
     Raises
     ------
@@ -34,9 +38,9 @@ class CurveMotion:
     """
 
     def __init__(self, problem: Problem, setup: Setup) -> None:
-        method, spec, truss = problem.method, problem.curve, truss_of(setup.arm)
+        method, spec, arm = problem.method, problem.curve, setup.arm
         family = setup.layout.family
-        assert family is not None, "an arm with faces is laid out with its curve"
+        assert family is not None, "an arm with stations is laid out with its curve"
         self._setup, self._task = setup, setup.task
         mistakes, rows = [], len(setup.task.row_names)
         spare = degree_of_redundancy(spec.control_vertices, rows, spec.torsion_vertices)
@@ -49,12 +53,14 @@ class CurveMotion:
             mistakes.append(problem.mistake(("curve", "torsion_vertices"), text))
         if mistakes:
             raise problem.error(mistakes)
-        centres = setup.arm.stations.centres(truss.home)
-        steps = np.linalg.norm(np.diff(centres, axis=0), axis=1)
-        self.s = np.concatenate([[0.0], np.cumsum(steps)]) / steps.sum()
-        self.home = Curve(
-            family, setup.control_vertices, np.zeros(spec.torsion_vertices), truss.face_frames[0]
-        )
+        centres, base = arm.stations.centres(arm.home), arm.stations.frames[0]
+        self.home = Curve(family, setup.control_vertices, np.zeros(spec.torsion_vertices), base)
+        between = [float(closest_to_point(self.home, centre).s[0]) for centre in centres[1:-1]]
+        self.s = np.maximum.accumulate([0.0, *between, 1.0])
+        self.roll = np.eye(3)
+        if setup.task.turns == "orientation":
+            x = arm.end_effector.frame[:, 0] @ self.home.frame(1.0)
+            self.roll = rotation_from_vector((0.0, 0.0, float(np.arctan2(x[1], x[0]))))
         # The curve's end is a constant combination of its vertices.
         self._end = family.weights(1.0)
         self._end_rows = self.home.position_jacobian(1.0)[self._task.axes]
@@ -62,22 +68,24 @@ class CurveMotion:
         gains = method.gains
         self._terms = {name: float(getattr(gains, name)) for name in names}
         self._weights = family.weights(self.s)
-        self._spacing = np.linalg.norm(np.diff(self._weights @ setup.control_vertices, axis=0), axis=1)
+        self._spacing = np.linalg.norm(np.diff(centres, axis=0), axis=1)
         vertices = spec.control_vertices
         second = np.diff(np.eye(vertices), n=2, axis=0) if vertices > 2 else np.zeros((0, vertices))
         self._bending = np.kron(second.T @ second, np.eye(3))
         self._base_rows = np.zeros((BASE_ROWS, self.home.coordinates))
         self._base_rows[:3, :3] = np.eye(3)
-        self._base_rows[3:, 3:6] = truss.face_frames[0][:, :2].T
+        self._base_rows[3:, 3:6] = base[:, :2].T
         s = np.linspace(0.0, 1.0, _SAMPLES + 1)
-        squares = ((self.home.position(s)[None] - truss.home[:, None]) ** 2).sum(axis=2)
-        self._node_s = s[np.argmin(squares, axis=1)]
+        squares = ((self.home.position(s)[None] - arm.points(arm.home_configuration)[:, None]) ** 2).sum(
+            axis=2
+        )
+        self._point_s = s[np.argmin(squares, axis=1)]
 
-    def follow(self, curve: Curve, goal: TipGoal, time: float, X: Array, *, correct: bool) -> Curve:
+    def follow(self, curve: Curve, goal: TipGoal, time: float, q: Array, *, correct: bool) -> Curve:
         """Return the curve after a step by eq. (38) to a goal; the goal's rates are the displacement to it.
 
         Without `correct` the end moves by that displacement to first order, as in the paper; with it the step
-        ends exactly at the goal. `X` (N, 3) are the truss's nodes, for the obstacle potential alone.
+        ends exactly at the goal. `q` is the arm's configuration, for the obstacle potential alone.
 
         Raises
         ------
@@ -93,7 +101,7 @@ class CurveMotion:
         dp = inverse.matrix @ x
         if self._terms:
             N = projector(inverse, J)
-            dp = dp + N @ null_space_vector(N, dp, self.objective(curve, X, time))
+            dp = dp + N @ null_space_vector(N, dp, self.objective(curve, q, time))
         curve = displaced(curve, dp)
         return self.corrected(curve, goal) if correct else curve
 
@@ -113,7 +121,7 @@ class CurveMotion:
             curve = displaced(curve, moore_penrose(self._rows(curve, across)).matrix @ x)
         raise SolverError("Newton's method on the curve's tip does not converge")
 
-    def objective(self, curve: Curve, X: Array, time: float) -> Cost:
+    def objective(self, curve: Curve, q: Array, time: float) -> Cost:
         """Return the null-space terms as a quadratic cost of the displacements (D,) of the curve's coordinates."""
         p = curve.control_vertices
         vertices, size = p.size, curve.coordinates
@@ -131,9 +139,9 @@ class CurveMotion:
             gradient[:vertices] += gain * rows.T @ (lengths - self._spacing)
         if gain := self._terms.get("smoothness"):
             hessian[:vertices, :vertices] += gain * self._bending
-            gradient[:vertices] += gain * self._bending @ p.ravel()
+            gradient[:vertices] += gain * self._bending @ (p - self.home.control_vertices).ravel()
         if gain := self._terms.get("obstacle_potential"):
-            rows, distance = self._near(curve, X, time)
+            rows, distance = self._near(curve, q, time)
             gain *= area
             stiffness = gain * potential_curvature(distance, self._setup.influence)
             hessian[:vertices, :vertices] += (rows.T * stiffness) @ rows
@@ -142,7 +150,7 @@ class CurveMotion:
 
     def _missing(self, curve: Curve, goal: TipGoal) -> tuple[Array, Array, Array]:
         """Return the error x_e - x(1), eq. (34), and the goal's rates, (n_e,) each; and the turned axes (r, 3)."""
-        rotation = curve.frame(1.0) if self._task.turns else np.eye(3)
+        rotation = curve.frame(1.0) @ self.roll if self._task.turns else np.eye(3)
         error, rate, across, _ = self._task.residual(self._end @ curve.control_vertices, rotation, goal)
         return error, rate, across
 
@@ -153,30 +161,29 @@ class CurveMotion:
             rows.append(across @ curve.orientation_jacobian(1.0))
         return np.concatenate([*rows, self._base_rows])
 
-    def _near(self, curve: Curve, X: Array, time: float) -> tuple[Array, Array]:
-        """Return rows (R, 3 V) of d distance / d p, and distances (R,), m, of the members near obstacles.
+    def _near(self, curve: Curve, q: Array, time: float) -> tuple[Array, Array]:
+        """Return rows (R, 3 V) of d distance / d p, and distances (R,), m, of the bodies near obstacles.
 
-        A member is assumed to move with its nearest point of the curve.
+        A body is assumed to move with its nearest point of the curve.
         """
         setup = self._setup
-        pairs = setup.monitor.near(setup.carrier.points(X), time, setup.influence)
+        pairs = setup.monitor.near(setup.carrier.points(q), time, setup.influence)
         # What the arm carries has no place on the curve.
-        with_obstacle = np.flatnonzero(~pairs.is_self & (pairs.body < len(setup.arm.bodies)))
-        members = truss_of(setup.arm).members[pairs.body[with_obstacle]]
-        t, normal = pairs.weights[with_obstacle, 1], pairs.normal[with_obstacle]
-        s = np.clip((1.0 - t) * self._node_s[members[:, 0]] + t * self._node_s[members[:, 1]], 0.0, 1.0)
-        witness = (1.0 - t)[:, None] * X[members[:, 0]] + t[:, None] * X[members[:, 1]]
-        first = curve.derivative(s)
-        tangent = first / np.linalg.norm(first, axis=1, keepdims=True)
+        kept = np.flatnonzero(~pairs.is_self & (pairs.body < len(setup.arm.bodies)))
+        # The weights of the obstacle's points are zero.
+        spanned, weights, normal = pairs.points[kept], pairs.weights[kept], pairs.normal[kept]
+        s = np.clip(np.einsum("rk,rk->r", weights, self._point_s[spanned]), 0.0, 1.0)
+        witness = np.einsum("rk,rkc->rc", weights, setup.arm.points(q)[spanned])
+        slopes = curve.derivative(s)
+        length = np.linalg.norm(slopes, axis=1, keepdims=True)
+        tangent = slopes / length
         # A witness point off the axis turns with the tangent: d q = d r + (t x d t) x (q - r).
         lever = np.cross(witness - curve.position(s), normal)
         turning = np.cross(lever, tangent)
         table, slope = curve.family.weights(s), curve.family.weights(s, 1)
-        across = (turning - np.einsum("rc,rc->r", turning, tangent)[:, None] * tangent) / np.linalg.norm(
-            first, axis=1, keepdims=True
-        )
+        across = (turning - np.einsum("rc,rc->r", turning, tangent)[:, None] * tangent) / length
         rows = np.einsum("rv,rc->rvc", table, normal) + np.einsum("rv,rc->rvc", slope, across)
-        return rows.reshape(len(s), 3 * table.shape[1]), pairs.distance[with_obstacle]
+        return rows.reshape(len(s), 3 * table.shape[1]), pairs.distance[kept]
 
 
 def displaced(curve: Curve, d: Array) -> Curve:

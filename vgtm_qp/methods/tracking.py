@@ -1,58 +1,81 @@
-"""Tracking a given curve, eq. (39), section 4.5: bay after bay, or all bays at once chained by small blocks."""
+"""Tracking a given curve, eq. (39), section 4.5: segment after segment, or all at once chained by blocks."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
+from typing import Protocol
 
 import numpy as np
 
-from vgtm_qp.arm.arm import Kinematics
-from vgtm_qp.arm.truss.arm import truss_of
-from vgtm_qp.arrays import Array
+from vgtm_qp.arrays import Array, Index
 from vgtm_qp.errors import SolverError
-from vgtm_qp.methods.assembly import CurveNodes, SegmentGroup, SegmentKinematics
+from vgtm_qp.methods.assembly import CurveNodes
 from vgtm_qp.methods.resolver import LENGTH_TOLERANCE, MAX_CORRECTIONS
 from vgtm_qp.methods.segments import Segment
-from vgtm_qp.qp.layout import Layout
 
-_STILL = 1e-11
+
+class SegmentEquations(Protocol):
+    """The equations of K segments of one shape, stacked: r rows over c own coordinates and b before them.
+
+    ``numbers`` (K,) are those of the segments; ``columns`` (K, c) are their own coordinates.
+    """
+
+    numbers: Index
+    columns: Index
+
+    def matrices(self) -> tuple[Array, Array]:
+        """Return the derivatives by own coordinates (K, r, c) and by those from ``Segment.first`` on (K, r, b)."""
+        ...
+
+    def displacements(self, moved: Array, turned: Array) -> Array:
+        """Return the right-hand sides (K, r) for curve nodes that move and turn, (S, 3) each, m and rad."""
+        ...
+
+    def residuals(self, q: Array, nodes: CurveNodes) -> Array:
+        """Return (K, r) what is missing at the evaluated configuration `q`."""
+        ...
+
+
+class SegmentedArm(Protocol):
+    """An arm in segments: everything that a :class:`Tracker` knows of it.
+
+    ``coordinates`` is their number, and ``furthest`` the greatest displacement, m, of one in an iteration.
+    """
+
+    coordinates: int
+    furthest: float
+
+    def equations(
+        self, segments: Sequence[Segment]
+    ) -> tuple[Callable[[Array], None], Sequence[SegmentEquations]]:
+        """Return what evaluates the equations of some segments at a configuration, and the equations in groups."""
+        ...
+
+    def move(self, q: Array, own: slice, d: Array) -> None:
+        """Add displacements `d` of the coordinates `own`, m, to a configuration."""
+        ...
 
 
 class Tracker:
-    """Moves the nodes of a truss so that its segments meet the curve nodes.
+    """Moves an arm so that its segments meet the curve nodes.
 
-    A segment with more motions than equations moves by the least sum of squares of its nodes' displacements
-    over the step; the others have one answer. Recursive and parallel tracking solve the same equations.
-    *Recursive* converges each segment before the next. *Parallel* factorises all segments at once at the
-    present configuration, and a chain of small products gives the effect of each on the next (block
-    condensation).
+    A segment with more motions than equations moves by the least displacements of its coordinates to first
+    order: in the row space of its matrix at the start of the step, where its answer is unique. Recursive and
+    parallel tracking solve the same equations. *Recursive* converges each segment before the next. *Parallel*
+    factorises all segments at once at the present configuration, and a chain of small products gives the
+    effect of each on the next (block condensation).
     """
 
-    def __init__(
-        self, layout: Layout, kinematics: Kinematics, segments: Sequence[Segment], *, parallel: bool
-    ) -> None:
-        self.segments = segments
-        self._free, self._columns = layout.arm.free, layout.node_columns
-        self._furthest = 2.0 * float(layout.arm.home_quantities.max())
+    def __init__(self, arm: SegmentedArm, segments: Sequence[Segment], *, parallel: bool) -> None:
+        self.segments, self._arm = segments, arm
         if parallel:
-            failure = "tracking: Newton's method on all bays at once {}"
-            self._chains = [_Chain(layout, segments, kinematics, kinematics.evaluate, failure)]
+            self._chains = [_Chain(arm, segments, "tracking: Newton's method on all segments at once {}")]
             return
-        single = SegmentKinematics(truss_of(layout.arm))
-        self._chains = [
-            _Chain(
-                layout,
-                [segment],
-                single,
-                partial(single.evaluate, segment=segment),
-                f"tracking: Newton's method {{}} in the bay below face {segment.face}",
-            )
-            for segment in segments
-        ]
+        failure = "tracking: Newton's method {{}} for the {}"
+        self._chains = [_Chain(arm, [one], failure.format(one.name)) for one in segments]
 
-    def rates(self, X: Array, moved: Array, turned: Array) -> Array:
-        """Return node positions (N, 3), m, after a step from `X` that follows the curve nodes to first order.
+    def rates(self, q: Array, moved: Array, turned: Array) -> Array:
+        """Return the configuration after a step from `q` that follows the curve nodes to first order.
 
         It solves eq. (39) for the curve nodes' displacements `moved` (S, 3), m, and rotation vectors `turned`
         (S, 3), rad.
@@ -62,113 +85,96 @@ class Tracker:
         SolverError
             A segment is in a singular pose.
         """
-        step, still = np.zeros(self._columns), np.zeros(self._columns)
+        step = np.zeros(self._arm.coordinates)
         for chain in self._chains:
-            chain.evaluate(X)
-            chain.solve([group.displacements(moved, turned) for group in chain.groups], still, step)
-        X = np.array(X)
-        X[self._free] += step.reshape(-1, 3)
-        return X
+            chain.evaluate(q)
+            chain.solve([group.displacements(moved, turned) for group in chain.groups], step)
+        q = np.array(q)
+        self._arm.move(q, slice(0, len(step)), step)
+        return q
 
-    def track(self, X: Array, nodes: CurveNodes) -> Array:
-        """Return node positions (N, 3), m, with end faces at the curve nodes and exact lengths, by Newton from `X`.
+    def track(self, q: Array, nodes: CurveNodes) -> Array:
+        """Return the configuration with end stations at the curve nodes and exact fixed lengths, by Newton from `q`.
 
-        The Jacobian is that of eq. (39). A step of a segment with spare motions is A^+ (residual + A t) - t, with t its
-        displacement from `X` so far. Its fixed point is the least displacement, whatever the iterates are.
+        The Jacobian is that of eq. (39).
 
         Raises
         ------
         SolverError
             Newton's method does not converge; the message names the segment.
         """
-        start, X = X, np.array(X)
-        travelled, step = np.zeros((2, self._columns))
+        start, q = q, np.array(q)
+        travelled, step = np.zeros((2, self._arm.coordinates))
         for chain in self._chains:
-            self._converge(chain, start, X, travelled, step, nodes)
-        return X
+            self._converge(chain, start, q, travelled, step, nodes)
+        return q
 
     def _converge(
-        self, chain: _Chain, start: Array, X: Array, travelled: Array, step: Array, nodes: CurveNodes
+        self, chain: _Chain, start: Array, q: Array, travelled: Array, step: Array, nodes: CurveNodes
     ) -> None:
-        """Move the nodes of a chain to their places; updates `X` and their displacements, `travelled`."""
-        # The first step starts at the old configuration of the bays below, and has their displacement as
+        """Move the segments of a chain to their places; updates `q` and the displacements, `travelled`."""
+        # The first step starts at the old configuration of the segments before, and has their displacement as
         # input.
         at, step[chain.before] = start, travelled[chain.before]
+        within = None
         for _ in range(MAX_CORRECTIONS + 1):
             chain.evaluate(at)
             residuals = [group.residuals(at, nodes) for group in chain.groups]
             is_met = all(float(np.abs(residual).max()) <= LENGTH_TOLERANCE for residual in residuals)
-            is_met = is_met and not step[chain.before].any()
-            if is_met and chain.is_square:
+            if is_met and not step[chain.before].any():
                 return
-            chain.solve(residuals, travelled, step)
+            within = chain.solve(residuals, step, within)
             own = step[chain.own]
-            largest = float(np.abs(own).max())
-            if is_met and largest <= _STILL:
-                return
-            if not largest <= self._furthest:
+            if not float(np.abs(own).max()) <= self._arm.furthest:
                 raise SolverError(chain.failure.format("diverges"))
             travelled[chain.own] += own
-            X[chain.nodes] += own.reshape(-1, 3)
-            at, step[chain.before] = X, 0.0
+            self._arm.move(q, chain.own, own)
+            at, step[chain.before] = q, 0.0
         raise SolverError(chain.failure.format("does not converge"))
 
 
 class _Chain:
-    """Segments that are solved at once, as one block-bidiagonal system.
+    """Segments that are solved at once, as one block-triangular system.
 
     Each segment's matrix is factorised independently. One sequential product a segment remains: of a small
-    matrix with the displacement of the nodes that the segment stands on.
+    matrix with the displacements of the coordinates that the segment stands on.
 
-    `evaluate` evaluates the kinematics of all ``groups`` at node positions (N, 3); `failure` is the format of the error
-    message. The segments place ``nodes``, columns ``own``, and stand on nodes with the columns ``before``.
+    `failure` is the format of the error message. The segments own the coordinates ``own``, and stand on those
+    ``before``. ``evaluate`` evaluates the equations of all ``groups`` at a configuration.
     """
 
-    def __init__(
-        self,
-        layout: Layout,
-        segments: Sequence[Segment],
-        kinematics: Kinematics | SegmentKinematics,
-        evaluate: Callable[[Array], None],
-        failure: str,
-    ) -> None:
-        shapes: dict[tuple[int, int, int, str], list[Segment]] = {}
-        for segment in segments:
-            before = segment.start - segment.first
-            shapes.setdefault((segment.rows, segment.columns, before, segment.tracks), []).append(segment)
+    def __init__(self, arm: SegmentedArm, segments: Sequence[Segment], failure: str) -> None:
         self._on_others = [segment for segment in segments if segment.first < segment.start]
-        self.groups = [SegmentGroup(layout, alike, kinematics) for alike in shapes.values()]
-        self.evaluate, self.failure = evaluate, failure
-        self.is_square = all(group.is_square for group in self.groups)
-        self.nodes = np.concatenate([segment.nodes for segment in segments])
-        self.own = slice(segments[0].start, segments[-1].start + segments[-1].columns)
+        self.evaluate, self.groups = arm.equations(segments)
+        self.failure = failure
+        self.own = slice(segments[0].start, segments[-1].end)
         self.before = slice(segments[0].first, segments[0].start)
 
-    def solve(self, right: list[Array], travelled: Array, step: Array) -> None:
-        """Overwrite the own columns of `step` with the solution of all segments, given the columns before them."""
+    def solve(self, right: list[Array], step: Array, within: list[Array] | None = None) -> list[Array]:
+        """Overwrite the own coordinates of `step` with the solution of all segments, given the coordinates before them.
+
+        Those of each segment are in the row space of `within`, matrices (K, r, c) of each group; by default of
+        the present ones. Returns these matrices.
+        """
         passed: dict[int, Array] = {}
-        for group, rhs in zip(self.groups, right, strict=True):
-            own, before = group.matrices()
-            total = rhs[:, :, None]
-            if not group.is_square:
-                total = total + own @ travelled[group.columns][:, :, None]
-            answers = _least_norm(own, np.concatenate([total, before], axis=2))
+        matrices = [group.matrices() for group in self.groups]
+        within = within or [own for own, _ in matrices]
+        for group, (own, before), rhs, rows in zip(self.groups, matrices, right, within, strict=True):
+            answers = _solution(own, np.concatenate([rhs[:, :, None], before], axis=2), rows)
             step[group.columns] = answers[:, :, 0]
-            if not group.is_square:
-                step[group.columns] -= travelled[group.columns]
             passed |= zip(group.numbers.tolist(), answers[:, :, 1:], strict=True)
         for segment in self._on_others:
-            end = segment.start + segment.columns
-            step[segment.start : end] -= passed[segment.number] @ step[segment.first : segment.start]
+            passes = passed[segment.number][:, : segment.start - segment.first]
+            step[segment.start : segment.end] -= passes @ step[segment.first : segment.start]
+        return within
 
 
-def _least_norm(A: Array, b: Array) -> Array:
-    """Return the solutions of A x = b, or those of least norm where A (K, r, c) has more columns than rows."""
-    rows, columns = A.shape[1:]
+def _solution(A: Array, b: Array, within: Array) -> Array:
+    """Return the solutions (K, c, n) of A x = b in the row space of `within`, which is shaped as A (K, r, c)."""
     try:
-        if rows == columns:
+        if A.shape[1] == A.shape[2]:
             return np.asarray(np.linalg.solve(A, b))
-        At = np.swapaxes(A, 1, 2)
-        return np.asarray(At @ np.linalg.solve(A @ At, b))
+        columns = np.swapaxes(within, 1, 2)
+        return np.asarray(columns @ np.linalg.solve(A @ columns, b))
     except np.linalg.LinAlgError:
-        raise SolverError("tracking: a bay is in a singular pose") from None
+        raise SolverError("tracking: a segment is in a singular pose") from None

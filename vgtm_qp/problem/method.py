@@ -126,13 +126,13 @@ class Weights(Table, called="[method.weights]"):
 
 
 class Gains(Table, called="[method.gains]"):
-    """Gains of the null-space vector of eq. (38), where the curve is solved before the truss."""
+    """Gains of the null-space vector of eq. (38), where the curve is solved before the arm."""
 
     spacing: Weight = Field(
-        default=1.0, description="spacings of the curve nodes less those at home, m^2; unit 1"
+        default=1.0, description="spacings of the curve nodes less those of the stations at home, m^2; unit 1"
     )
     smoothness: Weight = Field(
-        default=0.1, description="second differences of the control vertices, m^2; unit 1"
+        default=0.1, description="second differences of the control vertices less those at home, m^2; unit 1"
     )
     curve_rate: Weight = Field(
         default=1e-4, description="displacements of the control vertices in the null space, m^2; unit 1"
@@ -152,8 +152,8 @@ class Method(Table, called="[method]"):
     )
     tracking: Literal["coupled", "recursive", "parallel", "none"] = Field(
         default="coupled",
-        description="truss and curve together; curve first, then bay after bay or all bays at once; no curve. With "
-        "curve-pseudoinverse coupled means recursive",
+        description="arm and curve together; curve first, then segment after segment or all at once; no curve. The QP "
+        "alone takes bays for segments, of trusses; with curve-pseudoinverse coupled means recursive",
     )
     tracking_mode: Literal["exact", "hard", "elastic"] = Field(
         default="exact",
@@ -235,7 +235,7 @@ class Method(Table, called="[method]"):
 
     @property
     def moves_curve_first(self) -> bool:
-        """Whether the curve moves first, by itself, and the truss after it."""
+        """Whether the curve moves first, by itself, and the arm after it."""
         return self.name == "curve-pseudoinverse"
 
     def kept_by(self, name: str, tracking: str = "coupled") -> dict[str, Any]:

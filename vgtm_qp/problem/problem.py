@@ -193,12 +193,7 @@ class Problem(Table, called="a problem"):
             yield ("truss",), "a table [truss], or a table [arm] in its place"
         if self.truss is not None and self.arm is not None:
             yield ("arm",), "a truss or an arm, not both"
-        if self.arm is not None and self.method.name == "curve-pseudoinverse":
-            yield (
-                ("method", "name"),
-                '"qp" or "pseudoinverse": the curve first and then bays moves trusses alone',
-            )
-        elif self.arm is not None and self.method.tracking in ("recursive", "parallel"):
+        if self.arm is not None and self.method.goes_by_bays:
             yield ("method", "tracking"), '"coupled" or "none": the others go along the bays of a truss'
         if self.arm is not None and self.arm.body is not None and self.clearance.minimum_angle:
             yield ("clearance", "minimum_angle"), "0: bodies of their own do not meet in points"

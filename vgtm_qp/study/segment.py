@@ -34,7 +34,7 @@ def run(module: str, steps: int) -> Row:
     wanted = {round(k * steps / (_FRAMES - 1)) for k in range(_FRAMES)}
     frames, gap, angle = [], 0.0, 0.0
     for step, resolver in enumerate(moving_curve(problem)):
-        faces = np.array([segment.face for segment in resolver.tracker.segments])
+        faces = np.array([segment.station for segment in resolver.tracker.segments])
         s = resolver.motion.s[faces]
         centres = resolver.setup.arm.stations.centres(resolver.state.nodes)[faces]
         gap = max(gap, float(np.abs(centres - resolver.curve.position(s)).max()))
