@@ -1,4 +1,4 @@
-"""Clearance of an arm of capsules: near contacts, least distances, proofs between two states."""
+"""Clearance of an arm of capsules and hulls: near contacts, least distances, proofs between two states."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Clearance:
     Parameters
     ----------
     bodies
-        See :func:`vgtm_qp.geometry.bodies.capsules`.
+        See :mod:`vgtm_qp.geometry.bodies`.
     obstacles
         See :mod:`vgtm_qp.geometry.shapes`.
     safe, self_safe, influence : float

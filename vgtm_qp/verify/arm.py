@@ -27,7 +27,7 @@ class RecordedArm:
 
     Attributes
     ----------
-    members : (M, 2) int
+    members, links : (M, 2) int
         The two nodes of each member.
     home : (N, 3)
         Home positions of the nodes, m.
@@ -64,7 +64,7 @@ class RecordedArm:
         self.rate = table.numbers("rate", (count,), limits=True)
         self.acceleration = table.numbers("acceleration", (count,), limits=True)
         self.radius = table.numbers("radius", (count,))
-        self.is_hull = np.zeros(count, dtype=np.bool_)
+        self.is_hull, self.links = np.zeros(count, dtype=np.bool_), members
         tip = table.table("tip")
         self.tip = tip.integers("nodes", (None,), nodes)
         self.tip_weights = tip.numbers("weights", (len(self.tip),))

@@ -13,7 +13,6 @@ import numpy as np
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.curve.families import make_family
 from vgtm_qp.geometry.bodies import Hull
-from vgtm_qp.result.chain import RecordedChain
 from vgtm_qp.result.manifest import scene_problem
 from vgtm_qp.result.result import Result
 from vgtm_qp.rotation import rotation_from_vector
@@ -158,8 +157,6 @@ class Drawing:
     @cached_property
     def hulls(self) -> tuple[DrawnHull, ...]:
         """The bodies that are convex hulls; all others are drawn from end to end."""
-        if not isinstance(self.arm, RecordedChain):
-            return ()
         links, home = self.arm.links, self.arm.home
         own = [(body, np.unique(links[body])) for body in np.flatnonzero(self.arm.is_hull).tolist()]
         return tuple(DrawnHull.of(body, rows, home[rows]) for body, rows in own)
