@@ -88,7 +88,11 @@ class ArmScene:
                 placed = position[which], wxyz[which], colours[which]
                 handle = self._add_many(f"/members/{name}", tube, *placed, batched_scales=scales[which])
                 self._members.append((which, handle))
-        ball = trimesh.creation.icosphere(subdivisions=2, radius=1.35 * float(np.median(arm.radius)))
+        # Hulls hide the balls at their joints.
+        radius = (
+            1.35 * float(np.median(arm.radius[~arm.is_hull])) if not arm.is_hull.all() else 0.02 * self.unit
+        )
+        ball = trimesh.creation.icosphere(subdivisions=2, radius=radius)
         unturned = np.tile([1.0, 0.0, 0.0, 0.0], (len(drawing.marks), 1))
         dark = tuple(0.55 * channel for channel in FIXED_COLOUR)
         self._nodes = self._add_many("/nodes", ball, nodes[drawing.marks], unturned, dark)
