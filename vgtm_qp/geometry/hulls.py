@@ -73,7 +73,8 @@ class HullGroup(Group):
 
         Further contacts are vertices of a hull that are almost as near; their distances are ``FAR`` without any.
         """
-        sides, (x, y, normal, proven) = _Sides(self, pairs), self._witnesses(pairs)
+        sides = _Sides(self, pairs)
+        x, y, normal, proven = self._witnesses(pairs, sides)
         low, high = sides.heights(normal)
         gap = low.min(axis=1) - high
         found = np.zeros((len(pairs), _CONTACTS, 2 * self.scene.span + 5))
@@ -93,7 +94,8 @@ class HullGroup(Group):
         The least one is exact; others may be too small by the error of FCL's answers that are proven.
         """
         pairs = self.at(X, time, rows)
-        sides, (_, _, normal, proven) = _Sides(self, pairs), self._witnesses(pairs)
+        sides = _Sides(self, pairs)
+        _, _, normal, proven = self._witnesses(pairs, sides)
         found = sides.gaps(normal) - pairs[:, -2]
         nearest = found <= found.min(initial=np.inf) + 2.0 * PROOF * self.scene.unit
         for k in np.flatnonzero(proven & nearest).tolist():
@@ -109,7 +111,7 @@ class HullGroup(Group):
     def sweep(self, start: Array, end: Array) -> Array:
         """Return bounds (k, 3) as ``exact.sweep_function``, by a plane that turns from one contact to the next."""
         sides = [_Sides(self, pairs) for pairs in (start, end)]
-        normals = [self._witnesses(pairs)[2] for pairs in (start, end)]
+        normals = [self._witnesses(*both)[2] for both in zip((start, end), sides, strict=True)]
         (low, high), (low_after, high_after) = (
             side.heights(normal) for side, normal in zip(sides, normals, strict=True)
         )
@@ -130,10 +132,10 @@ class HullGroup(Group):
     def _deepest(self, rows: Index) -> Array:
         return np.full(len(rows), -np.inf)
 
-    def _witnesses(self, pairs: Array) -> tuple[Array, Array, Array, Mask]:
+    def _witnesses(self, pairs: Array, sides: _Sides) -> tuple[Array, Array, Array, Mask]:
         """Return nearest points (k, 3) of body and other, m, normals (k, 3), and which of them FCL supplied (k,)."""
         rows, fcl, unit = pairs[:, -1].astype(np.int64), self.scene.fcl, self.scene.unit
-        sides, proven = _Sides(self, pairs), np.zeros(len(pairs), dtype=bool)
+        proven = np.zeros(len(pairs), dtype=bool)
         x, y, normal = np.zeros((3, len(pairs), 3))
         if fcl is not None:
             own = pairs[:, :_POINTS].reshape(-1, 4, 3)
