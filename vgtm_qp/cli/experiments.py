@@ -102,7 +102,7 @@ def compare(
     return ExitCode.SOLVED
 
 
-_OPTIONS = ("scenes", "seed", "arms", "without_compiler", "changes")
+_OPTIONS = ("scenes", "seed", "arms", "without_compiler", "against", "changes")
 """Options that some of the studies have."""
 
 
@@ -134,6 +134,10 @@ def study(
         int | None,
         Parameter(help="solve one scene in so many without a compiler, too, of robustness: 10 by default"),
     ] = None,
+    against: Annotated[
+        Literal["ipopt"] | None,
+        Parameter(help="solve each scene by this method, too, step by step, of robustness"),
+    ] = None,
     changes: Annotated[
         float | None,
         Parameter(help="share of steps before which the scene changes, of loops: 0 by default"),
@@ -161,7 +165,7 @@ def study(
     for option, value in counts.items():
         if value is not None and value < 1:
             raise GoalError(f"{option} must be 1 or more, not {value}")
-    given = zip(_OPTIONS, (scenes, seed, arms, without_compiler, changes), strict=True)
+    given = zip(_OPTIONS, (scenes, seed, arms, without_compiler, against, changes), strict=True)
     options = {key: value for key, value in given if value is not None}
     for name in titles:
         study_tasks(name, short=short, **options)
