@@ -66,64 +66,61 @@ class Answer(NamedTuple):
 class NonlinearProgram:
     """A step of one arm over the positions of its free nodes, or in joint space over its actuators.
 
-    The objective has the QP's terms of the arm, of the progress and of the slacks of an elastic tip. There are `most`
-    rows of clearance.
+    The objective has the QP's terms of the arm, of the progress of a scaled tip, and of the slacks of an elastic one; a
+    hard tip has neither. There are `most` rows of clearance.
     """
 
-    def __init__(self, setup: Setup, most: int) -> None:
+    def __init__(self, setup: Setup, most: int, tip_mode: str) -> None:
         self._setup, self._most = setup, most
         arm, layout, names, constants = setup.arm, setup.layout, setup.task.row_names, Constants()
         weights, symbols, tip = layout.weights, arm.symbols(constants), arm.end_effector
-        self._in_joints = arm.bays is None
+        self._in_joints, self._ends = arm.bays is None, len(names)
         self.size = size = len(arm.actuators) if self._in_joints else 3 * len(arm.free)
-        start, d, alpha = ca.MX.sym("start", *symbols.shape), ca.MX.sym("d", size), ca.MX.sym("alpha")
-        slack, push, rows = (
-            ca.MX.sym("slack", 2 * len(names)),
-            ca.MX.sym("push"),
-            ca.MX.sym("rows", most, size),
-        )
+        self._progress, self._slacks = int(tip_mode == "scaled"), 2 * len(names) * (tip_mode == "elastic")
+        start, d = ca.MX.sym("start", *symbols.shape), ca.MX.sym("d", size)
+        alpha, slack = ca.MX.sym("alpha", self._progress), ca.MX.sym("slack", self._slacks)
+        push, rows = ca.MX.sym("push"), ca.MX.sym("rows", most, size)
         goal, turned = ca.MX.sym("goal", 3), ca.MX.sym("turned", 3, 3)
         velocity, spin = ca.MX.sym("velocity", 3), ca.MX.sym("spin", 3)
 
         q, actuators = symbols.along(start, d), arm.actuators.tolist()
-        X, quantities, left = symbols.nodes(q), symbols.quantities(q), 1.0 - alpha
-        place = X[:, tip.nodes.tolist()] @ ca.DM(tip.weights)
-        end = (place - goal + left * velocity)[axes(names)]
+        X, quantities, wanted, frame = symbols.nodes(q), symbols.quantities(q), goal, turned
+        if self._progress:
+            wanted, frame = goal - (1.0 - alpha) * velocity, rotated((alpha - 1.0) * spin) @ turned
+        end = (X[:, tip.nodes.tolist()] @ ca.DM(tip.weights) - wanted)[axes(names)]
         if setup.task.turns:
-            frame = Frames(arm.home[tip.nodes][None], tip.frame[None], tip.nodes[None], constants, "tip")
-            rotation, wanted = frame.at(X)[0], rotated(-left * spin) @ turned
+            frames = Frames(arm.home[tip.nodes][None], tip.frame[None], tip.nodes[None], constants, "tip")
+            rotation = frames.at(X)[0]
             # The axis of the turn to the goal by its sine, or of three turns by two thirds of it.
             columns = [2] if setup.task.turns == "pointing" else [0, 1, 2]
-            twist = sum(ca.cross(wanted[:, k], rotation[:, k]) for k in columns) / len(columns)
-            end = ca.vertcat(end, turned_axes(names, wanted) @ twist)
-        end -= slack[: len(names)] - slack[len(names) :]
+            twist = sum(ca.cross(frame[:, k], rotation[:, k]) for k in columns) / len(columns)
+            end = ca.vertcat(end, turned_axes(names, frame) @ twist)
+        if self._slacks:
+            end -= slack[: len(names)] - slack[len(names) :]
         moved = (X - symbols.nodes(start))[:, arm.free.tolist()]
         changed = (quantities - symbols.quantities(start))[actuators]
         off_home = (quantities - ca.DM(arm.home_quantities))[actuators]
-        levers = ca.DM(arm.levers)
+        levers, penalty = ca.DM(arm.levers), weights.end_effector * arm.unit
         objective = 0.5 * (
             weights.node_rate * ca.sumsqr(moved)
             + weights.actuator_rate * ca.sumsqr(levers * changed)
             + weights.stroke_centring * ca.sumsqr(levers * off_home)
-            + push * (alpha - 2.0) ** 2
-        ) + weights.end_effector * arm.unit * ca.dot(ca.DM(np.tile(layout.tip_levers, 2)), slack)
+            + push * ca.sumsqr(alpha - 2.0)
+        ) + penalty * ca.dot(ca.DM(np.resize(layout.tip_levers, self._slacks)), slack)
         # In joint space actuators are unknowns, and bounded as such.
         held = ca.MX(0, 1) if self._in_joints else quantities
         unknown, given = [d, alpha, slack], [start, goal, turned, velocity, spin, push, rows]
-        whole = ca.Function(
-            "whole",
-            [*unknown, *given, *constants.symbols],
-            [objective, ca.vertcat(held, end, rows @ d)],
-        ).expand()
-        x, p = ([ca.SX.sym(part.name(), *part.shape) for part in parts] for parts in (unknown, given))
+        results = [objective, ca.vertcat(held, end, rows @ d)]
+        whole = ca.Function("whole", [*unknown, *given, *constants.symbols], results).expand()
+        inputs = whole.sx_in()[: len(unknown) + len(given)]
         values = (
             ca.reshape(ca.DM(v), *s.shape) for v, s in zip(constants.values, constants.symbols, strict=True)
         )
-        f, g = whole(*x, *p, *values)
-        vectors = {"x": ca.vertcat(*x), "p": ca.veccat(*p), "f": f, "g": g}
+        f, g = whole(*inputs, *values)
+        x, p = ca.veccat(*inputs[: len(unknown)]), ca.veccat(*inputs[len(unknown) :])
+        vectors = {"x": x, "p": p, "f": f, "g": g}
         self._solver = ca.nlpsol("step", "ipopt", vectors, _OPTIONS)
-        self._ends = len(names)
-        self._multipliers = np.zeros(vectors["x"].numel()), np.zeros(g.numel())
+        self._multipliers = np.zeros(x.numel()), np.zeros(g.numel())
 
     def answer(
         self,
@@ -132,11 +129,8 @@ class NonlinearProgram:
         goal: TipGoal,
         rows: Array,
         floors: Array,
-        *,
         guess: Array,
         push: float = 0.0,
-        may_slow: bool = False,
-        elastic: bool = False,
     ) -> Answer | None:
         """Return the displacement from a configuration whose base has moved already; None where IPOPT fails.
 
@@ -152,8 +146,6 @@ class NonlinearProgram:
             Where the search begins.
         push
             Weight of the progress, m^2.
-        may_slow, elastic
-            Whether the tip may cover a part of its piece, and leave it.
         """
         arm, actuators, most = self._setup.arm, self._setup.arm.actuators, self._most
         nearest = np.argsort(-floors)[:most]
@@ -166,22 +158,13 @@ class NonlinearProgram:
         else:
             held = arm.home_quantities.copy(), arm.home_quantities.copy()
             held[0][actuators], held[1][actuators] = box
-        zero, none = np.zeros(self._ends), np.zeros(2 * self._ends)
+        whole, none, zero = np.ones(self._progress), np.zeros(self._slacks), np.zeros(self._ends)
+        place = [start.reshape(-1), goal.position, goal.rotation.T.reshape(-1), goal.velocity, goal.spin]
         found = self._solver(
-            x0=np.concatenate([np.clip(guess, low, high), [1.0], none]),
-            p=np.concatenate(
-                [
-                    start.reshape(-1),
-                    goal.position,
-                    goal.rotation.T.reshape(-1),
-                    goal.velocity,
-                    goal.spin,
-                    [push],
-                    table.T.reshape(-1),
-                ]
-            ),
-            lbx=np.concatenate([low, [0.0 if may_slow else 1.0], none]),
-            ubx=np.concatenate([high, [1.0], none + (np.inf if elastic else 0.0)]),
+            x0=np.concatenate([np.clip(guess, low, high), whole, none]),
+            p=np.concatenate([*place, [push], table.T.reshape(-1)]),
+            lbx=np.concatenate([low, 0.0 * whole, none]),
+            ubx=np.concatenate([high, whole, none + np.inf]),
             lbg=np.concatenate([held[0], zero, least]),
             ubg=np.concatenate([held[1], zero, np.full(most, np.inf)]),
             lam_x0=self._multipliers[0],
@@ -191,7 +174,7 @@ class NonlinearProgram:
             return None
         self._multipliers = np.asarray(found["lam_x"]).reshape(-1), np.asarray(found["lam_g"]).reshape(-1)
         x = np.asarray(found["x"]).reshape(-1)
-        return Answer(x[: self.size], float(x[self.size]))
+        return Answer(x[: self.size], float(x[self.size]) if self._progress else 1.0)
 
     def rows_over(self, q: Array, nodes: Index, coefficients: Array) -> Array:
         """Return rows (R, n) over the unknown displacements from rows over those of `nodes` (R, S)."""
@@ -234,7 +217,7 @@ class NonlinearResolver(MethodResolver):
 
     def __init__(self, problem: Problem) -> None:
         super().__init__(build_arm(problem, solves=False))
-        self._program = NonlinearProgram(self.setup, _PAIRS)
+        self._program = NonlinearProgram(self.setup, _PAIRS, self.setup.tip_mode)
         self._separation = Separation(self.setup)
         self._share = self._progress = 1.0
 
@@ -256,7 +239,7 @@ class NonlinearResolver(MethodResolver):
     def _move(self, path: Path, start: float, end: float, dt: float) -> Moved:
         setup, state, program = self.setup, self.state, self._program
         goal, time = path.at(end).over(end - start), state.after(dt)[0]
-        base, mode = setup.base_at(time), setup.tip_mode
+        base = setup.base_at(time)
         origin = state.q if base is None else setup.arm.based(state.q, base)
         short, box = self.too_near(state), self._box(state, dt)
         position, rotation = setup.arm.end_effector.position(state.nodes), path.at(start).rotation
@@ -266,17 +249,8 @@ class NonlinearResolver(MethodResolver):
         found = self._separation.rows(q, time, 0.0, setup.influence, short, 0.0)
         for _ in range(_ROUNDS):
             rows = program.rows_over(q, found.nodes, found.coefficients)
-            answer = program.answer(
-                origin,
-                box,
-                goal,
-                rows,
-                found.lower + rows @ displacement,
-                guess=guess,
-                push=push,
-                may_slow=mode == "scaled",
-                elastic=mode == "elastic",
-            )
+            floors = found.lower + rows @ displacement
+            answer = program.answer(origin, box, goal, rows, floors, guess, push)
             if answer is None:
                 raise SolverError("IPOPT finds no answer")
             displacement = guess = answer.displacement
