@@ -180,11 +180,11 @@ def draw(rows: Sequence[Row]) -> Figure:
 
 def text(rows: Sequence[Row]) -> str:
     """Give what was solved, what broke, what stopped the rest, and what differs without a compiler."""
-    if not rows:
-        return "No scene was run."
     theirs = {row["number"]: row for row in rows if row.get("against")}
     every = [row for row in rows if not row.get("against")]
     rows = select(every, compiler=True)
+    if not rows:
+        return "No scene was run."
     broken, refused = sum(bool(row["failures"]) for row in every), len(select(rows, status="refused"))
     groups = {module: select(rows, module=module) for module in sorted({row["module"] for row in rows})}
     for words in sorted({words for row in rows for words in row["features"]}):
