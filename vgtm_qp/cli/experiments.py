@@ -156,15 +156,11 @@ def study(
 
     # Before NumPy is imported: times and processes are for one BLAS thread each.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    from vgtm_qp.errors import GoalError
     from vgtm_qp.study import STUDIES, find_study, run_study, study_tasks
 
     wanted = list(STUDIES) if names == ["all"] else names
     titles = {name: find_study(name).title for name in wanted}
-    counts = {"--workers": workers, "--scenes": scenes, "--without-compiler": without_compiler}
-    for option, value in counts.items():
-        if value is not None and value < 1:
-            raise GoalError(f"{option} must be 1 or more, not {value}")
+    _check_counts({"--workers": workers, "--scenes": scenes, "--without-compiler": without_compiler})
     given = zip(_OPTIONS, (scenes, seed, arms, without_compiler, against, changes), strict=True)
     options = {key: value for key, value in given if value is not None}
     for name in titles:
@@ -190,6 +186,14 @@ def study(
     else:
         note("written: " + ", ".join(entry["folder"] for entry in written))
     return ExitCode.SOLVED
+
+
+def _check_counts(counts: dict[str, int | None]) -> None:
+    from vgtm_qp.errors import GoalError
+
+    for option, value in counts.items():
+        if value is not None and value < 1:
+            raise GoalError(f"{option} must be 1 or more, not {value}")
 
 
 def bench(

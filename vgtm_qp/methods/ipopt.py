@@ -56,7 +56,7 @@ _ARRIVED = 1e-7
 """Share of a piece that an interior point leaves uncovered at its end."""
 
 
-class Answer(NamedTuple):
+class ProgramAnswer(NamedTuple):
     """Displacements of the free nodes of a truss, m, or of actuators, and the progress, 0 to 1."""
 
     displacement: Array
@@ -131,7 +131,7 @@ class NonlinearProgram:
         floors: Array,
         guess: Array,
         push: float = 0.0,
-    ) -> Answer | None:
+    ) -> ProgramAnswer | None:
         """Return the displacement from a configuration whose base has moved already; None where IPOPT fails.
 
         Parameters
@@ -174,7 +174,7 @@ class NonlinearProgram:
             return None
         self._multipliers = np.asarray(found["lam_x"]).reshape(-1), np.asarray(found["lam_g"]).reshape(-1)
         x = np.asarray(found["x"]).reshape(-1)
-        return Answer(x[: self.size], float(x[self.size]) if self._progress else 1.0)
+        return ProgramAnswer(x[: self.size], float(x[self.size]) if self._progress else 1.0)
 
     def rows_over(self, q: Array, nodes: Index, coefficients: Array) -> Array:
         """Return rows (R, n) over the unknown displacements from rows over those of `nodes` (R, S)."""
