@@ -188,7 +188,7 @@ class ManeuverAttempt:
         last = float(plan.marks[-1])
         keeps_moving = bool(np.isfinite(arm.acceleration[arm.actuators]).any())
         while self.value < last:
-            aim, dt = plan.next_mark(self.value, keeps_moving=keeps_moving)
+            aim, dt = self._next_mark(self.value, keeps_moving=keeps_moving)
             before = resolver.state
             with self.log.clock():
                 aim, dt, step = self._follow(aim, dt)
@@ -209,14 +209,21 @@ class ManeuverAttempt:
                 progress(self.progress, step)
         return None
 
+    @property
+    def _may_be_late(self) -> bool:
+        return self.resolver.setup.tip_mode == "scaled"
+
+    def _next_mark(self, value: float, *, keeps_moving: bool = False) -> tuple[float, float]:
+        """Return the target of the step from `value` of the path, and its duration, s: for a tip on time the rest."""
+        aim, dt = self.plan.next_mark(value, keeps_moving=keeps_moving)
+        return aim, dt if self._may_be_late else aim - value
+
     def _follow(self, aim: float, dt: float) -> tuple[float, float, Step]:
         """Return the step towards `aim`, its aim and duration, s; a tip on time tries halves of a blocked one."""
         resolver, path, shortest = self.resolver, self.plan.path, _SHORTEST * dt
-        is_late = resolver.setup.tip_mode == "scaled"
-        dt = dt if is_late else aim - self.value
         step = resolver.follow(path, self.value, aim, dt=dt)
         whole = aim, dt, step
-        while step.status is StepStatus.BLOCKED and not is_late and dt > shortest:
+        while step.status is StepStatus.BLOCKED and not self._may_be_late and dt > shortest:
             dt /= 2.0
             aim = self.value + dt
             step = resolver.follow(path, self.value, aim, dt=dt)
@@ -241,7 +248,7 @@ class ManeuverAttempt:
         resolver, plan, value = self.resolver.relaxed(remedy), self.plan, self.value
         if resolver is None:
             return False
-        aim, dt = plan.next_mark(value)
+        aim, dt = self._next_mark(value)
         enough = value + _PART * remedy.progress * (aim - value)
         for _ in range(_TRIED_STEPS):
             step = resolver.follow(plan.path, value, aim, dt=dt)
