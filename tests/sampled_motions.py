@@ -101,6 +101,13 @@ def from_solid(distance, ends):
     return distance(ends[:, 0] + ((low + high) / 2.0)[:, None] * way)
 
 
+def at_least(distance, ends):
+    """Lower bounds (S,) of these distances: from the middles of eight parts, less half of a part."""
+    way = ends[:, 1] - ends[:, 0]
+    least = np.min([distance(ends[:, 0] + s * way) for s in (np.arange(8) + 0.5) / 8.0], axis=0)
+    return least - np.linalg.norm(way, axis=1) / 16.0
+
+
 def from_segment(one, other):
     """Distances (S,) of segments (S, 2, 3): the least over the lines, or with one of the four ends."""
     d, e, r = one[:, 1] - one[:, 0], other[:, 1] - other[:, 0], one[:, 0] - other[:, 0]
@@ -160,8 +167,10 @@ def spare(maneuver, samples, random):
             for m in np.flatnonzero(np.linalg.norm(box, axis=1) < size + radius + rules["safe"] + 0.05):
                 off = np.linalg.norm(middle[:, m] - at, axis=1) - size - half[:, m] - radius[m]
                 near = off < rules["safe"] + 0.01
+                at_rest = ends[:, m] - moved[:, None]
+                near[near] = at_least(distance, at_rest[near]) - radius[m] < rules["safe"] + 0.01
                 if near.any():
-                    found = from_solid(distance, ends[near, m] - moved[near, None]) - radius[m]
+                    found = from_solid(distance, at_rest[near]) - radius[m]
                     note(found, rules["safe"], f"{names[m]} / {obstacle['name']}", time[near], is_state[near])
         for m, j in pairs:
             box = np.maximum(np.maximum(low[m] - high[j], low[j] - high[m]), 0.0)
