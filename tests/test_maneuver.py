@@ -251,15 +251,15 @@ def test_whatever_comes_out_of_a_random_scene_is_verified(problem):
         assert maneuver.clearance.min() >= problem.clearance.safe - 1e-9
 
 
-def test_a_tip_that_stays_on_time_takes_shorter_steps_where_a_whole_one_turns_the_arm_too_far():
-    """A snake of 26 joints; its first step alone would turn it by more than can be proven to be clear."""
-    problem = varied_scene(1991, 32, arms="serial")
+def test_a_tip_that_stays_on_time_takes_shorter_steps_where_a_whole_one_is_blocked():
+    """A snake of 26 joints; as a whole its first step turns it too far for the QPs to converge."""
+    problem = varied_scene(1991, 32, steps=10, arms="serial")
     assert problem.end_effector.mode == "hard"
     maneuver = solve(
         problem.replace({"method": problem.method.kept_by("qp", "none"), "method.retries": False})
     )
     assert (maneuver.status, maneuver.certificate.failures()) == ("solved", ())
     np.testing.assert_allclose(maneuver.time, 10.0 * maneuver.progress, atol=1e-9)
-    durations = 30.0 / 10.0 * np.diff(maneuver.time)
+    durations = np.diff(maneuver.time)
     assert durations.min() < 0.6
     assert durations.max() < 1.0 + 1e-9
