@@ -18,6 +18,7 @@ from vgtm_qp.maneuver.solve import solve
 from vgtm_qp.problem import Problem, load_problem
 from vgtm_qp.step.qp_resolver import QPResolver
 from vgtm_qp.step.step import StepStatus
+from vgtm_qp.study.varied import varied_scene
 from vgtm_qp.verify import verify
 
 PROBLEMS = Path(__file__).parents[1] / "problems"
@@ -248,3 +249,17 @@ def test_whatever_comes_out_of_a_random_scene_is_verified(problem):
     assert bool(maneuver.blocked_by) == (maneuver.status == "blocked")
     if problem.obstacle:
         assert maneuver.clearance.min() >= problem.clearance.safe - 1e-9
+
+
+def test_a_tip_that_stays_on_time_takes_shorter_steps_where_a_whole_one_is_blocked():
+    """A snake of 26 joints; as a whole its first step turns it too far for the QPs to converge."""
+    problem = varied_scene(1991, 32, steps=10, arms="serial")
+    assert problem.end_effector.mode == "hard"
+    maneuver = solve(
+        problem.replace({"method": problem.method.kept_by("qp", "none"), "method.retries": False})
+    )
+    assert (maneuver.status, maneuver.certificate.failures()) == ("solved", ())
+    np.testing.assert_allclose(maneuver.time, 10.0 * maneuver.progress, atol=1e-9)
+    durations = np.diff(maneuver.time)
+    assert durations.min() < 0.6
+    assert durations.max() < 1.0 + 1e-9

@@ -1,8 +1,13 @@
 import numpy as np
 import pytest
+from sampled_motions import is_safe, spare
 
+from vgtm_qp.maneuver.plan import make_plan
+from vgtm_qp.maneuver.solve import solve
+from vgtm_qp.methods import Resolver
+from vgtm_qp.methods.ipopt import NonlinearResolver
 from vgtm_qp.step.build import build_arm
-from vgtm_qp.study.robustness import draw, features, kind_of, run, tasks, text
+from vgtm_qp.study.robustness import draw, features, kind_of, run, solve_by_ipopt, tasks, text
 from vgtm_qp.study.scenes import MODULES, SAFE, random_scene
 from vgtm_qp.study.varied import varied_scene
 
@@ -108,3 +113,78 @@ def test_no_scene_of_a_new_seed_is_unsafe_or_ends_without_a_word(rng, arms):
     tried = [row for row in rows if row["status"] != "refused"]
     assert {row["status"] for row in tried} <= {"solved", "blocked"}
     assert all((row["status"] == "solved") != bool(row["stop"]) for row in tried)
+
+
+@pytest.mark.parametrize("number", [1, 10, 43])
+def test_sampled_motions_agree_with_the_certificate_and_show_a_clearance_that_is_not_kept(number):
+    maneuver = solve(varied_scene(1991, number, arms="serial"))
+    random, certificate = np.random.default_rng(number), maneuver.certificate
+    rules = maneuver.manifest["problem"]["clearance"]
+    rules["self_safe"] = rules["safe"] / 4.0
+    floors = rules["safe"], rules["self_safe"]
+
+    def room(name):
+        found = certificate.measures[name], certificate.measures[f"self_{name}"]
+        return min(measure.value - floor for measure, floor in zip(found, floors, strict=True))
+
+    least = spare(maneuver, 100, random)
+    assert is_safe(maneuver, least)
+    assert least["at"][0] == pytest.approx(room("clearance"), abs=1e-8)
+    assert least["between"][0] >= room("clearance_between") - 1e-8
+    rules["safe"] = certificate.clearance.value + 1e-3
+    more = spare(maneuver, 20, random)
+    assert more["at"][0] == pytest.approx(-1e-3, abs=1e-8)
+    assert not is_safe(maneuver, more)
+
+
+@pytest.mark.parametrize("arms", ["trusses", "serial"])
+def test_ipopt_solves_scenes_step_by_step_with_exact_states(arms):
+    given = tasks(False, scenes=2, seed=7, steps=12, arms=arms, without_compiler=9, against="ipopt")
+    assert [task.get("against") for task in given] == [None, "ipopt", None, None, "ipopt"]
+    rows = [{**task, **run(**task)} for task in given]
+    theirs = [row for row in rows if row.get("against")]
+    assert all(row["failures"] == row["between"] for row in theirs)
+    assert any(row["status"] == "solved" for row in theirs)
+    assert "by IPOPT without any curve" in text(rows)
+
+
+@pytest.mark.parametrize("number", [4, 7, 15, 21, 28])
+def test_a_scene_for_ipopt_keeps_tip_and_limits_of_every_kind(number):
+    """Hard and elastic tips, limited accelerations, jams; what is not exact at states would be a failure."""
+    maneuver = solve_by_ipopt(varied_scene(1991, number, arms="serial"))
+    assert maneuver.steps > 5
+    assert [line for line in maneuver.certificate.failures() if "between" not in line] == []
+
+
+@pytest.mark.parametrize("number", [10, 20])
+def test_ipopt_finds_no_worse_step_than_the_qp_and_nearly_the_same_short_one(number):
+    scene = varied_scene(1991, number, arms="serial")
+    changes = {"method": scene.method.kept_by("qp", "none"), "obstacle": [], "end_effector.mode": "hard"}
+    scene = scene.replace(changes)
+    setup, weights = Resolver(scene).setup, scene.method.weights
+    arm = setup.arm
+
+    def cost(q):
+        change, off_home = (
+            arm.levers * (q - start)[arm.actuators] for start in (home, arm.home_configuration)
+        )
+        moved = arm.nodes(q) - arm.nodes(home)
+        terms = (
+            (weights.node_rate, moved),
+            (weights.actuator_rate, change),
+            (weights.stroke_centring, off_home),
+        )
+        return sum(weight * float(np.sum(values**2)) for weight, values in terms)
+
+    home = arm.home_configuration
+    for share in (1.0, 0.05):
+        found = []
+        for resolver in (Resolver(scene), NonlinearResolver(scene)):
+            plan = make_plan(scene, *resolver.tip())
+            end = share * float(plan.marks[0])
+            step = resolver.follow(plan.path, 0.0, end, dt=end)
+            assert step.status == "reached"
+            np.testing.assert_allclose(resolver.tip()[0], plan.path.at(end).position, atol=1e-8)
+            found.append(step.state.q)
+        assert cost(found[1]) <= cost(found[0]) * (1.0 + 1e-5)
+    assert np.abs(found[1] - found[0]).max() < 0.1 * np.abs(found[0] - home).max()

@@ -1,9 +1,10 @@
 """Make the tables of figures in README.md of this folder again, each by its own command.
 
-    python examples/studies/tables.py              all of them but the three below, in half an hour on two cores
+    python examples/studies/tables.py              all of them but the four below, in half an hour on two cores
     python examples/studies/tables.py figure8      only this one
     python examples/studies/tables.py tracking     a thousand scenes in six forms: another hour and more
     python examples/studies/tables.py robustness   a thousand scenes with and without a compiler: two hours
+    python examples/studies/tables.py serial       serial arms beside IPOPT: half an hour and more
     python examples/studies/tables.py loops        100,000 steps: half an hour
     python examples/studies/tables.py --short      every command in its quick form; the document stays as it is
 
@@ -42,15 +43,16 @@ OPTIONS = {
 """Of the studies that take any."""
 COMMANDS = {
     **{name: f"vgtm study {name} {OPTIONS.get(name, '')}".strip() for name in STUDIES},
-    "serial": "vgtm study robustness --arms serial --scenes 100 --seed 1991",
+    "serial": "vgtm study robustness --arms serial --scenes 200 --seed 20261215 --without-compiler 999 "
+    "--against ipopt",
     "changes": "vgtm study loops --scenes 100 --seed 20261203 --changes 0.4",
     "bench": "vgtm bench --seconds 0.7",
 }
-LONG = {"tracking", "robustness", "loops"}
+LONG = {"tracking", "robustness", "serial", "loops"}
 """Made only where they are asked for by name, or with --short."""
 SHORT = {
     **{name: f"vgtm study {name} --short" for name in STUDIES},
-    "serial": "vgtm study robustness --arms serial --short",
+    "serial": "vgtm study robustness --arms serial --short --against ipopt",
     "changes": "vgtm study loops --short --changes 0.4",
     "bench": "vgtm bench --scene cubes --bays 5 --tracking elastic --seconds 0.1 --steps 20 --baselines eq28",
 }

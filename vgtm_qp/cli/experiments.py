@@ -102,7 +102,7 @@ def compare(
     return ExitCode.SOLVED
 
 
-_OPTIONS = ("scenes", "seed", "arms", "without_compiler", "changes")
+_OPTIONS = ("scenes", "seed", "arms", "without_compiler", "against", "changes")
 """Options that some of the studies have."""
 
 
@@ -134,6 +134,10 @@ def study(
         int | None,
         Parameter(help="solve one scene in so many without a compiler, too, of robustness: 10 by default"),
     ] = None,
+    against: Annotated[
+        Literal["ipopt"] | None,
+        Parameter(help="solve each scene by this method, too, step by step, of robustness"),
+    ] = None,
     changes: Annotated[
         float | None,
         Parameter(help="share of steps before which the scene changes, of loops: 0 by default"),
@@ -152,16 +156,12 @@ def study(
 
     # Before NumPy is imported: times and processes are for one BLAS thread each.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    from vgtm_qp.errors import GoalError
     from vgtm_qp.study import STUDIES, find_study, run_study, study_tasks
 
     wanted = list(STUDIES) if names == ["all"] else names
     titles = {name: find_study(name).title for name in wanted}
-    counts = {"--workers": workers, "--scenes": scenes, "--without-compiler": without_compiler}
-    for option, value in counts.items():
-        if value is not None and value < 1:
-            raise GoalError(f"{option} must be 1 or more, not {value}")
-    given = zip(_OPTIONS, (scenes, seed, arms, without_compiler, changes), strict=True)
+    _check_counts({"--workers": workers, "--scenes": scenes, "--without-compiler": without_compiler})
+    given = zip(_OPTIONS, (scenes, seed, arms, without_compiler, against, changes), strict=True)
     options = {key: value for key, value in given if value is not None}
     for name in titles:
         study_tasks(name, short=short, **options)
@@ -186,6 +186,14 @@ def study(
     else:
         note("written: " + ", ".join(entry["folder"] for entry in written))
     return ExitCode.SOLVED
+
+
+def _check_counts(counts: dict[str, int | None]) -> None:
+    from vgtm_qp.errors import GoalError
+
+    for option, value in counts.items():
+        if value is not None and value < 1:
+            raise GoalError(f"{option} must be 1 or more, not {value}")
 
 
 def bench(

@@ -37,6 +37,8 @@ _NOTHING_LEFT = 1e-9
 _FURTHER = 1e-3
 """Share of the whole path by which a retry must get further than the best so far to replace it."""
 
+_SHORTEST = 1 / 8
+"""Share of a step that is tried last if the tip may not be late."""
 _TRIED_STEPS = 10
 _PART = 0.25
 """Share of a remedy's progress to first order from which on the arm counts as going on with it."""
@@ -186,10 +188,10 @@ class ManeuverAttempt:
         last = float(plan.marks[-1])
         keeps_moving = bool(np.isfinite(arm.acceleration[arm.actuators]).any())
         while self.value < last:
-            aim, dt = plan.next_mark(self.value, keeps_moving=keeps_moving)
+            aim, dt = self._next_mark(self.value, keeps_moving=keeps_moving)
             before = resolver.state
             with self.log.clock():
-                step = resolver.follow(plan.path, self.value, aim, dt=dt)
+                aim, dt, step = self._follow(aim, dt)
             if step.status is StepStatus.BLOCKED:
                 return self._explain(aim, dt, step)
             stop = self._explain(aim, dt, step, before) if self._gives_up(step) else None
@@ -206,6 +208,26 @@ class ManeuverAttempt:
             if progress is not None:
                 progress(self.progress, step)
         return None
+
+    @property
+    def _may_be_late(self) -> bool:
+        return self.resolver.setup.tip_mode == "scaled"
+
+    def _next_mark(self, value: float, *, keeps_moving: bool = False) -> tuple[float, float]:
+        """Return the target of the step from `value` of the path, and its duration, s: for a tip on time the rest."""
+        aim, dt = self.plan.next_mark(value, keeps_moving=keeps_moving)
+        return aim, dt if self._may_be_late else aim - value
+
+    def _follow(self, aim: float, dt: float) -> tuple[float, float, Step]:
+        """Return the step towards `aim`, its aim and duration, s; a tip on time tries halves of a blocked one."""
+        resolver, path, shortest = self.resolver, self.plan.path, _SHORTEST * dt
+        step = resolver.follow(path, self.value, aim, dt=dt)
+        whole = aim, dt, step
+        while step.status is StepStatus.BLOCKED and not self._may_be_late and dt > shortest:
+            dt /= 2.0
+            aim = self.value + dt
+            step = resolver.follow(path, self.value, aim, dt=dt)
+        return (aim, dt, step) if step.moved else whole
 
     def resumed(self, stop: Stop | None, progress: Progress | None) -> Stop | None:
         """Go on from a stop at which the arm stalled, wherever a later step is free; return the stop that stays.
@@ -226,7 +248,7 @@ class ManeuverAttempt:
         resolver, plan, value = self.resolver.relaxed(remedy), self.plan, self.value
         if resolver is None:
             return False
-        aim, dt = plan.next_mark(value)
+        aim, dt = self._next_mark(value)
         enough = value + _PART * remedy.progress * (aim - value)
         for _ in range(_TRIED_STEPS):
             step = resolver.follow(plan.path, value, aim, dt=dt)

@@ -104,7 +104,7 @@ def run_study(
         Called with the number of tasks done, and of all tasks.
     options
         Of the study: ``scenes`` and ``seed`` of tracking, robustness and loops, ``arms`` of the last two,
-        ``without_compiler`` of robustness, and ``changes`` of loops.
+        ``without_compiler`` and ``against`` of robustness, and ``changes`` of loops.
 
     Raises
     ------
