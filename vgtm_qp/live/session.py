@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from vgtm_qp.arm.arm import GRAVITY, Arm
 from vgtm_qp.arrays import Array
 from vgtm_qp.live.holding import hold_of, pairs_too_near
 from vgtm_qp.live.reading import OUTCOMES, Reading
@@ -193,11 +194,16 @@ class Session(Surroundings):
         self._use(with_method(self.problem.replace({"method": given}), name))
 
     def forces(self, load: ArrayLike) -> Array:
-        """Return (M,) what members or joints bear where a force (3,), N, pulls at the tip; see ``Arm.forces``.
+        """Return (M,) what members or joints bear where a force (3,), N, pulls at the tip, and of the arm's weight.
 
-        SolverError in a singular pose.
+        See ``Arm.forces``; SolverError in a singular pose.
         """
-        return self._resolver.setup.arm.forces(self.state.q, np.asarray(load, dtype=float))
+        return self.arm.forces(self.state.q, np.asarray(load, dtype=float), gravity=GRAVITY)
+
+    @property
+    def arm(self) -> Arm:
+        """The arm that is moved."""
+        return self._resolver.setup.arm
 
     def advance(self, dt: float) -> bool:
         """Make one step of duration `dt`, s, towards the goals; return whether the arm moved.

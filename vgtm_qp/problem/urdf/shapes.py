@@ -99,9 +99,9 @@ class Shapes:
         file = next((path for path in tried if _is_file(path)), None)
         if file is None:
             places = ", ".join(str(path) for path in tried[:4])
-            self._mistakes.add(
-                shape, f"{what} filename", name, f"a file that exists; there is none at {places}"
-            )
+            more = "; package_path of the problem adds places" if name.startswith("package://") else ""
+            expected = f"a file that exists; there is none at {places}{more}"
+            self._mistakes.add(shape, f"{what} filename", name, expected)
             return None
         if file not in self._meshes:
             try:
@@ -122,7 +122,8 @@ class Shapes:
         places = [path / part for path in self._packages for part in (rest, inner)]
         for folder in (beside, *beside.parents):
             places += [folder / rest] + ([folder / inner] if folder.name == package else [])
-        return places
+        # The folder of a package may have been renamed: URDF files are in it, or in a folder of it.
+        return [*places, beside / inner, beside.parent / inner]
 
 
 def _read_mesh(file: Path) -> Array:
