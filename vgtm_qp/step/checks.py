@@ -87,9 +87,9 @@ def unreachable_tip(problem: Problem, setup: Setup) -> Iterator[Mistake]:
 
 
 def find_warnings(problem: Problem, setup: Setup) -> list[Mistake]:
-    """Return suspicious values of a problem: a home pose nearer than ``safe``, a target at an obstacle, a weak joint.
+    """Return suspicious values of a problem: a home pose nearer than ``safe``, a target at an obstacle, weak joints.
 
-    None of them is impossible: the resolver moves the arm away from obstacles too near at home, and a tip of three nodes
+    None of them is impossible: the resolver moves the arm away from what is too near at home, and a tip of three nodes
     may surround an obstacle with its centre inside.
     """
     certain = {mistake.key for mistake in check_problem(problem, setup)}
