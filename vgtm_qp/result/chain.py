@@ -184,6 +184,23 @@ class RecordedChain:
 
         The points are the base, the joints, the tip, and those of bodies.
         """
+        points, axes, frames = self._along(q)
+        at, frame = frames[-1]
+        points.append(at + frame @ self.tip)
+        own = np.empty((len(q), *self.points.shape))
+        for carrier in np.unique(self.carriers).tolist():
+            origin, attitude = frames[carrier]
+            rows = np.flatnonzero(self.carriers == carrier)
+            own[:, rows] = origin[:, None] + self.points[rows] @ np.swapaxes(attitude, 1, 2)
+        return np.concatenate([np.stack(points, axis=1), own], axis=1), np.stack(axes, axis=1), frame
+
+    def frames(self, q: Array) -> tuple[Array, Array]:
+        """Return origins (Q, J + 1, 3), m, and attitudes (Q, J + 1, 3, 3) of the base's frame and the joints'."""
+        origins, attitudes = zip(*self._along(q)[2], strict=True)
+        return np.stack(origins, axis=1), np.stack(attitudes, axis=1)
+
+    def _along(self, q: Array) -> tuple[list[Array], list[Array], list[tuple[Array, Array]]]:
+        """Return base and joints (Q, 3), m, the joints' axes (Q, 3), and the frames of base and joints."""
         count = len(self.quantity_names)
         at, frame = q[:, count : count + 3], rotations(q[:, count + 3 :])
         turns = np.where(self.revolute, q[:, :count], 0.0)[..., None] * self.axis
@@ -197,13 +214,7 @@ class RecordedChain:
             if not self.revolute[j]:
                 at = at + q[:, j, None] * axes[-1]
             frames.append((at, frame))
-        points.append(at + frame @ self.tip)
-        own = np.empty((len(q), *self.points.shape))
-        for carrier in np.unique(self.carriers).tolist():
-            origin, attitude = frames[carrier]
-            rows = np.flatnonzero(self.carriers == carrier)
-            own[:, rows] = origin[:, None] + self.points[rows] @ np.swapaxes(attitude, 1, 2)
-        return np.concatenate([np.stack(points, axis=1), own], axis=1), np.stack(axes, axis=1), frame
+        return points, axes, frames
 
     def ends(self, points: Array) -> Array:
         """Return (..., B, V, 3) the ends or vertices of the links for points (..., J + 2 + P, 3)."""

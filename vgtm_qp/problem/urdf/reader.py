@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,6 +16,7 @@ from vgtm_qp.problem.urdf.frames import AT_REST, Frame, Origins, after, inverse
 from vgtm_qp.problem.urdf.inertials import WEIGHTLESS, Mass, mass_of
 from vgtm_qp.problem.urdf.shapes import Shapes
 from vgtm_qp.problem.urdf.text import Element, Mistakes, read_xml
+from vgtm_qp.problem.urdf.visuals import UrdfVisual, surfaces_of
 
 Array = NDArray[np.float64]
 
@@ -151,6 +152,29 @@ def read_urdf(
     found, bare = tree.bodies(places, shapes)
     mistakes.stop()
     return UrdfArm(joints, *tip_frame, found, base, tip, (*notes, *bare), (path, *shapes.files))
+
+
+def read_visuals(
+    file: str | Path,
+    *,
+    base_link: str | None = None,
+    tip_link: str | None = None,
+    package_path: Sequence[str | Path] = (),
+) -> tuple[tuple[UrdfJoint, ...], tuple[UrdfVisual, ...]]:
+    """Return the joints of the arm of :func:`read_urdf`, and what is drawn of its links.
+
+    Shapes whose files are missing or damaged are left out. ProblemError where joints cannot be read.
+    """
+    path = Path(file)
+    mistakes = Mistakes(path)
+    tree = _Tree(read_xml(path), mistakes)
+    base, tip = tree.ends(base_link, tip_link)
+    chain = tree.chain(base, tip)
+    places, _ = tree.places(chain, base)
+    joints, _ = tree.moving(chain, places)
+    mistakes.stop()
+    shapes = Shapes(path.absolute(), [Path(place).absolute() for place in package_path], mistakes)
+    return joints, tuple(tree.visuals(places, shapes))
 
 
 @dataclass(frozen=True, eq=False)
@@ -364,6 +388,13 @@ class _Tree:
             bodies += self._bodies(link, number, frame, shapes)
         bodies.sort(key=lambda body: body.joint)
         return tuple(bodies), tuple(notes)
+
+    def visuals(self, places: Mapping[str, Place], shapes: Shapes) -> Iterator[UrdfVisual]:
+        """Yield what is drawn of links at their places."""
+        for link, (number, frame) in places.items():
+            for visual in self._links[link].all("visual"):
+                at = after(frame, self._origins.of(visual, f'link "{link}", <visual>'))
+                yield from surfaces_of(visual, number, at, shapes, self._root)
 
     def _beside(self, link: str) -> list[_Joint]:
         """Return the joints of a link: to its children and to its parent."""
