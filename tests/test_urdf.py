@@ -18,6 +18,7 @@ from urdf_texts import ARM, BROKEN, placed
 
 import vgtm_qp as vq
 from vgtm_qp.arm.build import make_arm
+from vgtm_qp.cli import main
 from vgtm_qp.problem.urdf import read_urdf
 from vgtm_qp.problem.urdf.shapes import enclosing_capsule
 
@@ -378,6 +379,42 @@ def test_mistakes_of_the_urdf_are_those_of_the_problem(folder):
     (mistake,) = raised.value.mistakes
     assert mistake.value == '"lower 2, upper 1.5"'
     assert mistake.key == 'arm.urdf, line 19, joint "lift", <limit>'
+    (folder / "robots").mkdir()
+    (folder / "arm.urdf").rename(folder / "robots/small.urdf")
+    file.write_text(
+        file.read_text().replace('"arm.urdf"', '"robots/small.urdf"') + "[clearance]\nsafe = -1\n"
+    )
+    with pytest.raises(vq.ProblemError) as raised:
+        vq.load_problem(file)
+    assert [mistake.key for mistake in raised.value.mistakes] == [
+        'robots/small.urdf, line 19, joint "lift", <limit>',
+        "clearance.safe",
+    ]
+
+
+def test_joints_without_velocity_are_told(folder, capsys):
+    text = ARM.replace('velocity="0.8"', 'velocity="0"').replace(' velocity="1.5"', "")
+    (folder / "arm.urdf").write_text(text)
+    assert main(["check", str(problem_file(folder))]) == 0
+    assert "joints turn, lift may move at any rate" in capsys.readouterr().err
+    (folder / "arm.urdf").write_text(ARM)
+    assert main(["check", str(problem_file(folder))]) == 0
+    assert "rate" not in capsys.readouterr().err
+
+
+def test_a_joint_too_weak_for_the_arm_s_weight_is_told(folder, capsys):
+    heavy = '<link name="camera"><inertial><mass value="100"/></inertial>'
+    (folder / "arm.urdf").write_text(ARM.replace('<link name="camera">', heavy))
+    assert main(["check", str(problem_file(folder))]) == 0
+    told = capsys.readouterr()
+    (line,) = (line for line in told.err.splitlines() if "effort" in line)
+    assert 'arm.joint[1] ("lift").effort: found 50.0; expected' in line
+    assert "which joint lift bears at home" in line
+    assert "104 kg" in told.out
+    frames = placed(ARM, {"turn": 0.1, "lift": 0.4, "slide": 0.2})
+    lever = frames["camera"][:3, 3] - frames["arm"][:3, 3]
+    borne = abs(np.cross(lever, [0.0, 0.0, -981.0]) @ frames["arm"][:3, 1])
+    assert f"expected {borne:.4g} or more" in line
 
 
 def test_keys_of_a_urdf_are_refused_without_one():

@@ -26,7 +26,7 @@ from vgtm_qp.problem.fields import (
     exactly,
     unexpected,
 )
-from vgtm_qp.problem.table import Place, Table, increasing, known_names, unique
+from vgtm_qp.problem.table import IN_FILE, Place, Table, increasing, known_names, unique
 from vgtm_qp.problem.truss import BasePose, LockTable
 from vgtm_qp.problem.urdf import UrdfJoint, read_urdf
 
@@ -258,7 +258,7 @@ def _urdf_keys(data: Mapping[str, Any], context: Mapping[str, Any]) -> dict[str,
         bodies = data.get("bodies", "hull")
         arm = read_urdf(folder / Path(file).expanduser(), **links, package_path=found, bodies=bodies)
     except ProblemError as error:
-        raise _wrong([_of_file(mistake) for mistake in error.mistakes]) from None
+        raise _wrong([_of_file(file, mistake) for mistake in error.mistakes]) from None
     except (TypeError, ValueError, RuntimeError):
         # The types of the keys themselves report what is wrong with these.
         return {}
@@ -279,10 +279,10 @@ def _urdf_keys(data: Mapping[str, Any], context: Mapping[str, Any]) -> dict[str,
     return {"joint": joints, **tip} | ({"body": bodies} if bodies else {})
 
 
-def _of_file(mistake: Mistake) -> tuple[Place, str | None, str]:
-    """Return place, value and expectation of a mistake in a URDF file."""
+def _of_file(file: str, mistake: Mistake) -> tuple[Place, str | None, str]:
+    """Return place, value and expectation of a mistake in a URDF file, which the problem calls `file`."""
     value = None if mistake.value == "nothing" else mistake.value.strip('"')
-    return (f"urdf, {mistake.key}",), value, mistake.expected
+    return (f"{IN_FILE}{file}, {mistake.key}",), value, mistake.expected
 
 
 def _joint_keys(joint: UrdfJoint, home: Any) -> dict[str, Any]:

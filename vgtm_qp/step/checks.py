@@ -95,7 +95,19 @@ def find_warnings(problem: Problem, setup: Setup) -> list[Mistake]:
     certain = {mistake.key for mistake in check_problem(problem, setup)}
     near = [mistake for distance, mistake in _at_home(problem, setup) if distance > 0.0]
     doubtful = [mistake for mistake in _inside_obstacles(problem, setup, 0.0) if mistake.key not in certain]
-    return [*near, *doubtful, *_weak_joints(problem, setup), *excess_of_freedom(problem, setup)]
+    weak = [*_weak_joints(problem, setup), *_joints_without_rate(problem)]
+    return [*near, *doubtful, *weak, *excess_of_freedom(problem, setup)]
+
+
+def _joints_without_rate(problem: Problem) -> Iterator[Mistake]:
+    """Yield the URDF file whose joints have no velocity, or 0, which means no limit."""
+    if problem.arm is None or problem.arm.urdf is None:
+        return
+    names = [joint.name for joint in problem.arm.joint if joint.rate is None and joint.mimic is None]
+    if names:
+        several = f"joints {', '.join(names)}" if len(names) > 1 else f"joint {names[0]}"
+        expected = f"velocity limits greater than 0 in the file; {several} may move at any rate"
+        yield problem.mistake(("arm", "urdf"), expected)
 
 
 def _weak_joints(problem: Problem, setup: Setup) -> Iterator[Mistake]:
