@@ -173,7 +173,9 @@ def read_visuals(
     places, _ = tree.places(chain, base)
     joints, _ = tree.moving(chain, places)
     mistakes.stop()
-    shapes = Shapes(path.absolute(), [Path(place).absolute() for place in package_path], mistakes)
+    shapes = Shapes(
+        path.absolute(), [Path(place).absolute() for place in package_path], mistakes, "primitives"
+    )
     return joints, tuple(tree.visuals(places, shapes))
 
 
