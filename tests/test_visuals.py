@@ -84,11 +84,12 @@ def test_visual_shapes_have_their_sizes_and_colours_and_are_where_the_file_puts_
     values = {"turn": 0.7, "lift": -0.4, "slide": 0.3}
     frames = placed(ARM, values)
     arm = Session(problem).drawing.arm
-    origins, attitudes = arm.frames(np.array([[*values.values(), *[0.0] * 6]]))
+    moved = arm.along(np.array([[*values.values(), *[0.0] * 6]]))[2]
     offset = placed(f'<robot><link name="a"/><link name="b"/><joint name="j" type="fixed"><parent link="a"/>'
                     f'<child link="b"/>{AT}</joint></robot>', {})["b"]  # fmt: skip
     for surface, (link, size) in zip(surfaces, SIZES.items(), strict=True):
-        points = origins[0, surface.joint] + surface.vertices @ attitudes[0, surface.joint].T
+        origin, attitude = moved[surface.joint]
+        points = origin[0] + surface.vertices @ attitude[0].T
         back = np.linalg.inv(frames[link] @ offset)
         own = points @ back[:3, :3].T + back[:3, 3]
         np.testing.assert_allclose([own.min(axis=0), own.max(axis=0)], np.outer([-0.5, 0.5], size), atol=2e-3)
@@ -141,14 +142,14 @@ def test_links_move_with_the_joints_and_can_be_hidden(problem):
     scene = LinkScene(handles, drawing.arm, drawing.links())
     assert [name.rpartition("/")[0] for name in handles.meshes] == [f"/links/{k}" for k in (0, 1, 1, 2, 2)]
     q = np.array([0.3, -0.2, 0.25, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
-    origins, attitudes = drawing.arm.frames(q[None])
+    moved = drawing.arm.along(q[None])[2]
     for resolution in (0.0, 2.0**-12):
         scene.move(q, resolution)
         for k in range(3):
-            frame = handles.frames[f"/links/{k}"]
-            np.testing.assert_allclose(frame.position, origins[0, k], atol=1e-6 + resolution)
+            frame, (origin, attitude) = handles.frames[f"/links/{k}"], moved[k]
+            np.testing.assert_allclose(frame.position, origin[0], atol=1e-6 + resolution)
             turned = Rotation.from_quat(np.roll(frame.wxyz, -1)).as_matrix()
-            np.testing.assert_allclose(turned, attitudes[0, k], atol=1e-6 + 4.0 * resolution)
+            np.testing.assert_allclose(turned, attitude[0], atol=1e-6 + 4.0 * resolution)
     scene.show(False)
     assert not any(frame.visible for frame in handles.frames.values())
 

@@ -180,11 +180,8 @@ class RecordedChain:
         return is_padded and same(self.points[own[:count]], points)
 
     def placed(self, q: Array) -> tuple[Array, Array, Array]:
-        """Return points (Q, J + 2 + P, 3), m, axes (Q, J, 3) and last frames (Q, 3, 3) at configurations (Q, J + 6).
-
-        The points are the base, the joints, the tip, and those of bodies.
-        """
-        points, axes, frames = self._along(q)
+        """Return base, joints, tip and points of bodies (Q, J + 2 + P, 3), m, axes (Q, J, 3), last frames (Q, 3, 3)."""
+        points, axes, frames = self.along(q)
         at, frame = frames[-1]
         points.append(at + frame @ self.tip)
         own = np.empty((len(q), *self.points.shape))
@@ -194,13 +191,8 @@ class RecordedChain:
             own[:, rows] = origin[:, None] + self.points[rows] @ np.swapaxes(attitude, 1, 2)
         return np.concatenate([np.stack(points, axis=1), own], axis=1), np.stack(axes, axis=1), frame
 
-    def frames(self, q: Array) -> tuple[Array, Array]:
-        """Return origins (Q, J + 1, 3), m, and attitudes (Q, J + 1, 3, 3) of the base's frame and the joints'."""
-        origins, attitudes = zip(*self._along(q)[2], strict=True)
-        return np.stack(origins, axis=1), np.stack(attitudes, axis=1)
-
-    def _along(self, q: Array) -> tuple[list[Array], list[Array], list[tuple[Array, Array]]]:
-        """Return base and joints (Q, 3), m, the joints' axes (Q, 3), and the frames of base and joints."""
+    def along(self, q: Array) -> tuple[list[Array], list[Array], list[tuple[Array, Array]]]:
+        """Return base and joints (Q, 3), m, axes of joints (Q, 3), and origins and attitudes after base and joints."""
         count = len(self.quantity_names)
         at, frame = q[:, count : count + 3], rotations(q[:, count + 3 :])
         turns = np.where(self.revolute, q[:, :count], 0.0)[..., None] * self.axis

@@ -62,10 +62,11 @@ class LinkScene:
 
     def move(self, q: Array, resolution: float = 0.0) -> None:
         """Put the links where they are at a configuration (J + 6,); coordinates are rounded to a `resolution`."""
-        origins, attitudes = self._arm.frames(q[None])
-        turns = np.roll(Rotation.from_matrix(attitudes[0]).as_quat(), 1, axis=-1)
+        frames = self._arm.along(q[None])[2]
         for k, frame in self._frames.items():
-            for key, value in (("position", origins[0, k]), ("wxyz", turns[k])):
+            origin, attitude = frames[k]
+            turn = np.roll(Rotation.from_matrix(attitude[0]).as_quat(), 1)
+            for key, value in (("position", origin[0]), ("wxyz", turn)):
                 rounded = np.round(value / resolution) * resolution if resolution else value
                 setattr(frame, key, rounded.astype(np.float32))
 
