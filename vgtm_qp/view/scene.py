@@ -79,7 +79,7 @@ class ArmScene:
 
         self._server, self._scene, self._drawing = server, server.scene, drawing
         arm, self.unit = drawing.arm, float(drawing.arm.size)
-        self.ball = max(0.085 * self.unit, 1.8 * float(np.median(arm.radius)))
+        self.ball = max((0.3 if drawing.hulls else 0.085) * self.unit, 1.8 * float(np.median(arm.radius)))
         self._scene.set_up_direction("+z")
         self._scene.world_axes.visible = False
         self._add_ground(nodes)
@@ -121,7 +121,8 @@ class ArmScene:
         self._obstacles = {_path(mesh): self._add_obstacle(mesh) for mesh in drawing.obstacles}
         surfaces = drawing.links()
         if surfaces and isinstance(arm, RecordedChain):
-            self.links, self.ball = LinkScene(self._scene, arm, surfaces), 0.6 * self.ball
+            self.links = LinkScene(self._scene, arm, surfaces)
+            self.ball = min(self.ball, 0.3 * self.unit)
             self.show(links=True, bodies=False)
 
     def show(self, *, links: bool, bodies: bool) -> None:
