@@ -50,7 +50,7 @@ class SerialArm(JointSpaceArm):
         self.chain = chain if spec.every else replace(chain, every=self._every(chain))
         self.functions, self.constants = self.chain.functions, self.chain.constants
         self.movers = self.chain.movers
-        self.mass = float(chain.mass.sum())
+        self.mass, self.weight = float(chain.mass.sum()), chain.weight
         self.revolute, self.reaches = chain.revolute, self._reaches()
         self.actuator_units = tuple("rad" if turns else "m" for turns in self.revolute[self.actuated])
         self._place_stations(spec.tip_rotation_vector)
@@ -283,13 +283,6 @@ class SerialArm(JointSpaceArm):
     def _carriers(self) -> Index:
         """Return (B,) numbers of the joints that bodies of the table move with."""
         return np.asarray(self.chain.carriers[self.bodies.points[:, 0] - len(self.chain) - 2])
-
-    def forces(self, q: Array, load: Array, gravity: Array | None = None) -> Array:
-        """See ``arm.Arm``."""
-        borne = super().forces(q, load)
-        if gravity is not None:
-            borne += self.by_quantities(self.chain.weight(q, gravity)[None])[0]
-        return borne
 
     def record(self) -> dict[str, Any]:
         """See ``arm.Arm``.
