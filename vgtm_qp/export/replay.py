@@ -93,7 +93,8 @@ def replay(maneuver: Result) -> Replay:
     """Replay a maneuver in MuJoCo, as it was solved and under gravity.
 
     The physics replay drives the length of every member, or the value of every joint, through equality constraints, in
-    straight lines between the states; gravity pulls. Members and links have `vgtm_qp.export.mjcf.MASS_PER_LENGTH`.
+    straight lines between the states; gravity pulls. Joints have the masses of the problem, if it gives any; otherwise
+    members and links have `vgtm_qp.export.mjcf.MASS_PER_LENGTH`.
 
     Raises
     ------

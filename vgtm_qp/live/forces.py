@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
+from vgtm_qp.arm.arm import Arm
 from vgtm_qp.arrays import Array
 from vgtm_qp.errors import SolverError
 from vgtm_qp.live.stage import PageStage
@@ -26,7 +29,9 @@ class ForceTools:
         self._stage, self.said = stage, ""
         gui, inbox = stage.server.gui, stage.inbox
         self._load = gui.add_vector3("force at the tip [N]", _LOAD, step=10.0)
-        self._is_shown = gui.add_checkbox("Show forces", False, hint="the weight of the arm is left out")
+        self._is_shown = gui.add_checkbox(
+            "Show forces", False, hint="with the arm's own weight, where its joints have masses"
+        )
         self._text = gui.add_markdown("")
         for widget in (self._load, self._is_shown):
             inbox.on(widget.on_update, lambda _: self._stage.draw(), newest="force")
@@ -38,28 +43,40 @@ class ForceTools:
         if not self._is_shown.value:
             stage.scene.painted, said = None, ""
         else:
-            arm = stage.session.drawing.arm
+            are_lengths = stage.session.drawing.arm.unit == "m"
             try:
                 forces = stage.session.forces(self._load.value)
-                said = told(forces, arm.quantity_names, arm.unit == "m")
-                stage.scene.painted = force_colours(forces) if arm.unit == "m" else None
+                said = told(forces, stage.session.arm, are_lengths)
+                stage.scene.painted = force_colours(forces) if are_lengths else None
             except SolverError as error:
                 stage.scene.painted, said = None, str(error)
         if said != self.said:
             self.said = self._text.content = said
 
 
-def told(forces: Array, names: tuple[str, ...], are_lengths: bool) -> str:
-    """Return the greatest pull and push of members, or the greatest torque of joints, in words."""
+def told(forces: Array, arm: Arm, are_lengths: bool) -> str:
+    """Return the greatest pull and push of members, or the greatest loads of joints, in words."""
     if not len(forces):
         return ""
     if not are_lengths:
-        k = int(np.argmax(np.abs(forces)))
-        return f"greatest load of a joint: {abs(forces[k]):.4g} N m (N where it slides) at {names[k]}"
-    pull, push = int(np.argmax(forces)), int(np.argmin(forces))
+        return "  \n".join(_of_joints(forces, arm))
+    names, pull, push = arm.quantity_names, int(np.argmax(forces)), int(np.argmin(forces))
     parts = []
     if forces[pull] > 0.0:
         parts.append(f"greatest pull: {forces[pull]:.4g} N in {names[pull]} (blue)")
     if forces[push] < 0.0:
         parts.append(f"greatest push: {-forces[push]:.4g} N in {names[push]} (red)")
     return "  \n".join(parts)
+
+
+def _of_joints(forces: Array, arm: Arm) -> Iterator[str]:
+    """Yield the greatest load of a joint, what weighs on them, and the joints that bear more than they may."""
+    borne, unit = np.abs(forces), "N m (N where it slides)"
+    k = int(np.argmax(borne))
+    yield f"greatest load of a joint: {borne[k]:.4g} {unit} at {arm.quantity_names[k]}"
+    if arm.mass:
+        yield f"with the arm's own weight, {arm.mass:.4g} kg"
+    if arm.effort is None:
+        return
+    for k in np.flatnonzero(arm.actuated & (borne > arm.effort)).tolist():
+        yield f"**{arm.quantity_names[k]} bears {borne[k]:.4g}, more than its effort limit {arm.effort[k]:g}**"

@@ -14,6 +14,7 @@ from vgtm_qp.live.curves import Curves
 from vgtm_qp.live.forces import ForceTools
 from vgtm_qp.live.handles import Handles
 from vgtm_qp.live.journey import GoalTools
+from vgtm_qp.live.looks import Looks
 from vgtm_qp.live.obstacles import ObstacleTools
 from vgtm_qp.live.player import Player
 from vgtm_qp.live.readout import read_out
@@ -72,6 +73,7 @@ class Page:
 
     _player: Player
     _goal: GoalTools
+    _looks: Looks
     _obstacles: ObstacleTools
     _forces: ForceTools
     _settings: Settings
@@ -179,7 +181,7 @@ class Page:
         session = Session(problem)
         self._stage.open(session)
         self._player.clear()
-        for part in (self._handles, self._obstacles, self._goal):
+        for part in (self._handles, self._obstacles, self._goal, self._looks):
             part.rebuild()
         self._settings.follow()
         self._curves.clear()
@@ -195,6 +197,7 @@ class Page:
         gui.set_panel_label(session.drawing.name or "vgtm")
         self._read_out = gui.add_html(read_out(session, ""))
         self._curves = Curves(gui)
+        self._looks = Looks(self._stage)
         tabs = gui.add_tab_group()
         names = ("Move", "Obstacles", "Forces", "Maneuver", "Method")
         # A result is there to be played first of all.

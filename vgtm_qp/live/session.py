@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from vgtm_qp.arm.arm import GRAVITY, Arm
 from vgtm_qp.arrays import Array
 from vgtm_qp.live.holding import hold_of, pairs_too_near
 from vgtm_qp.live.reading import OUTCOMES, Reading
@@ -18,6 +19,7 @@ from vgtm_qp.live.surroundings import Surroundings
 from vgtm_qp.methods import Resolver, method_name
 from vgtm_qp.methods.presets import with_method
 from vgtm_qp.problem import Problem
+from vgtm_qp.result.chain import RecordedChain
 from vgtm_qp.rows.curve import fitted
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.setup import Setup
@@ -77,8 +79,9 @@ class Session(Surroundings):
 
     @property
     def nodes(self) -> Array:
-        """(N, 3) the nodes that are drawn, m: without those beside the stations of a serial arm."""
-        return self.state.nodes[: len(self.drawing.arm.home)]
+        """(N, 3) the nodes that are drawn, m: of a serial arm those of its record, with all vertices of its hulls."""
+        arm = self.drawing.arm
+        return arm.placed(self.state.q[None])[0][0] if isinstance(arm, RecordedChain) else self.state.nodes
 
     @property
     def state(self) -> State:
@@ -193,11 +196,16 @@ class Session(Surroundings):
         self._use(with_method(self.problem.replace({"method": given}), name))
 
     def forces(self, load: ArrayLike) -> Array:
-        """Return (M,) what members or joints bear where a force (3,), N, pulls at the tip; see ``Arm.forces``.
+        """Return (M,) what members or joints bear where a force (3,), N, pulls at the tip, and of the arm's weight.
 
-        SolverError in a singular pose.
+        See ``Arm.forces``; SolverError in a singular pose.
         """
-        return self._resolver.setup.arm.forces(self.state.q, np.asarray(load, dtype=float))
+        return self.arm.forces(self.state.q, np.asarray(load, dtype=float), gravity=GRAVITY)
+
+    @property
+    def arm(self) -> Arm:
+        """The arm that is moved."""
+        return self._resolver.setup.arm
 
     def advance(self, dt: float) -> bool:
         """Make one step of duration `dt`, s, towards the goals; return whether the arm moved.

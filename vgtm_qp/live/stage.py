@@ -78,6 +78,7 @@ class PageStage:
             self.scene.put(self._shown, session.state.time)
         for prepare in self.prepares:
             prepare()
-        self.scene.move(session.nodes, session.control_vertices, session.state.time)
+        state = session.state
+        self.scene.move(session.nodes, session.control_vertices, state.time, q=state.q)
         for draw in self.draws:
             draw()

@@ -17,6 +17,7 @@ from vgtm_qp.problem.fields import (
     Distance,
     File,
     Limit,
+    Mass,
     Name,
     Number,
     Onset,
@@ -25,7 +26,7 @@ from vgtm_qp.problem.fields import (
     exactly,
     unexpected,
 )
-from vgtm_qp.problem.table import Place, Table, increasing, known_names, unique
+from vgtm_qp.problem.table import IN_FILE, Place, Table, increasing, known_names, unique
 from vgtm_qp.problem.truss import BasePose, LockTable
 from vgtm_qp.problem.urdf import UrdfJoint, read_urdf
 
@@ -70,6 +71,11 @@ class Joint(Table, called="a joint"):
     home: Number = Field(default=0.0, description="joint value of the home pose, rad or m")
     rate: Limit | None = Field(default=None, description="greatest speed, rad/s or m/s")
     acceleration: Limit | None = Field(default=None, description="greatest acceleration, rad/s^2 or m/s^2")
+    effort: Limit | None = Field(default=None, description="greatest torque, N m, or force, N, of its drive")
+    mass: Mass = Field(default=0.0, description="of what it moves up to the next joint, kg")
+    center_of_mass: Vector = Field(
+        default=ORIGIN, description="where that has its centre, in its own frame, m"
+    )
     mimic: Mimic | None = Field(
         default=None,
         description="the joint that it follows: {joint, multiplier, offset}; its home and its drive are that joint's",
@@ -153,7 +159,7 @@ class ArmTable(Table, called="an arm"):
         description="attitude of the end effector in the last frame, rad; along the arm at home where absent",
     )
     body: tuple[ArmBody, ...] | None = Field(
-        default=None, description="what is kept clear; where absent, capsules between successive joints"
+        default=None, description="what is kept clear; without any, capsules between successive joints"
     )
     link_radius: Distance = Field(
         default=0.03, description="radius of the capsules between successive joints, m"
@@ -252,7 +258,7 @@ def _urdf_keys(data: Mapping[str, Any], context: Mapping[str, Any]) -> dict[str,
         bodies = data.get("bodies", "hull")
         arm = read_urdf(folder / Path(file).expanduser(), **links, package_path=found, bodies=bodies)
     except ProblemError as error:
-        raise _wrong([_of_file(mistake) for mistake in error.mistakes]) from None
+        raise _wrong([_of_file(file, mistake) for mistake in error.mistakes]) from None
     except (TypeError, ValueError, RuntimeError):
         # The types of the keys themselves report what is wrong with these.
         return {}
@@ -270,13 +276,13 @@ def _urdf_keys(data: Mapping[str, Any], context: Mapping[str, Any]) -> dict[str,
         for body in arm.bodies
     ]
     tip = {"tip": arm.tip.tolist(), "tip_rotation_vector": _vector(arm.tip_rotation)}
-    return {"joint": joints, **tip, "body": bodies}
+    return {"joint": joints, **tip} | ({"body": bodies} if bodies else {})
 
 
-def _of_file(mistake: Mistake) -> tuple[Place, str | None, str]:
-    """Return place, value and expectation of a mistake in a URDF file."""
+def _of_file(file: str, mistake: Mistake) -> tuple[Place, str | None, str]:
+    """Return place, value and expectation of a mistake in a URDF file, which the problem calls `file`."""
     value = None if mistake.value == "nothing" else mistake.value.strip('"')
-    return (f"urdf, {mistake.key}",), value, mistake.expected
+    return (f"{IN_FILE}{file}, {mistake.key}",), value, mistake.expected
 
 
 def _joint_keys(joint: UrdfJoint, home: Any) -> dict[str, Any]:
@@ -292,7 +298,9 @@ def _joint_keys(joint: UrdfJoint, home: Any) -> dict[str, Any]:
     mimic = None
     if joint.mimic is not None:
         mimic = dict(zip(("joint", "multiplier", "offset"), joint.mimic, strict=True))
-    limits = {"limits": joint.limits, "rate": joint.rate, "mimic": mimic}
+    limits = {"limits": joint.limits, "rate": joint.rate, "effort": joint.effort, "mimic": mimic}
+    if joint.mass:
+        keys |= {"mass": joint.mass, "center_of_mass": joint.center_of_mass.tolist()}
     return keys | {key: value for key, value in limits.items() if value is not None}
 
 

@@ -203,10 +203,15 @@ def _echo(found: ErrorDetails) -> bool:
     return found["type"] == "too_short" and len(found["input"]) >= found["ctx"]["min_length"]
 
 
+IN_FILE = "in file "
+"""What begins a place that is in another file; no key has blanks."""
+
+
 def key_path(data: Any, place: Place) -> str:
     """Return a place in a table, or in the mapping it is made from, as ``obstacle[1] ("right cube").size``.
 
-    The tags of unions, ``"<...>"`` before a deeper key, are left out.
+    The tags of unions, ``"<...>"`` before a deeper key, are left out. What begins with :data:`IN_FILE` is a place in
+    another file, which the table names, and is told without the keys before it.
     """
     path = ""
     for depth, part in enumerate(place):
@@ -214,6 +219,8 @@ def key_path(data: Any, place: Place) -> str:
             data = data[part] if isinstance(data, list | tuple) and part < len(data) else None
             name = entry(data, "name")
             path += f"[{part}]" + (f' ("{_line(name, 40)}")' if isinstance(name, str) else "")
+        elif part.startswith(IN_FILE):
+            return _line(part.removeprefix(IN_FILE), 240)
         elif part.startswith("<") and depth + 1 < len(place) and entry(data, part) is None:
             continue
         else:

@@ -180,10 +180,19 @@ class RecordedChain:
         return is_padded and same(self.points[own[:count]], points)
 
     def placed(self, q: Array) -> tuple[Array, Array, Array]:
-        """Return points (Q, J + 2 + P, 3), m, axes (Q, J, 3) and last frames (Q, 3, 3) at configurations (Q, J + 6).
+        """Return base, joints, tip and points of bodies (Q, J + 2 + P, 3), m, axes (Q, J, 3), last frames (Q, 3, 3)."""
+        points, axes, frames = self.along(q)
+        at, frame = frames[-1]
+        points.append(at + frame @ self.tip)
+        own = np.empty((len(q), *self.points.shape))
+        for carrier in np.unique(self.carriers).tolist():
+            origin, attitude = frames[carrier]
+            rows = np.flatnonzero(self.carriers == carrier)
+            own[:, rows] = origin[:, None] + self.points[rows] @ np.swapaxes(attitude, 1, 2)
+        return np.concatenate([np.stack(points, axis=1), own], axis=1), np.stack(axes, axis=1), frame
 
-        The points are the base, the joints, the tip, and those of bodies.
-        """
+    def along(self, q: Array) -> tuple[list[Array], list[Array], list[tuple[Array, Array]]]:
+        """Return base and joints (Q, 3), m, axes of joints (Q, 3), and origins and attitudes after base and joints."""
         count = len(self.quantity_names)
         at, frame = q[:, count : count + 3], rotations(q[:, count + 3 :])
         turns = np.where(self.revolute, q[:, :count], 0.0)[..., None] * self.axis
@@ -197,13 +206,7 @@ class RecordedChain:
             if not self.revolute[j]:
                 at = at + q[:, j, None] * axes[-1]
             frames.append((at, frame))
-        points.append(at + frame @ self.tip)
-        own = np.empty((len(q), *self.points.shape))
-        for carrier in np.unique(self.carriers).tolist():
-            origin, attitude = frames[carrier]
-            rows = np.flatnonzero(self.carriers == carrier)
-            own[:, rows] = origin[:, None] + self.points[rows] @ np.swapaxes(attitude, 1, 2)
-        return np.concatenate([np.stack(points, axis=1), own], axis=1), np.stack(axes, axis=1), frame
+        return points, axes, frames
 
     def ends(self, points: Array) -> Array:
         """Return (..., B, V, 3) the ends or vertices of the links for points (..., J + 2 + P, 3)."""

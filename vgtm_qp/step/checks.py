@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from vgtm_qp.arm.arm import rank
+from vgtm_qp.arm.arm import GRAVITY, rank
 from vgtm_qp.arrays import Array
 from vgtm_qp.curve.redundancy import BASE_ROWS, excess_freedom
 from vgtm_qp.errors import Mistake
@@ -87,15 +87,40 @@ def unreachable_tip(problem: Problem, setup: Setup) -> Iterator[Mistake]:
 
 
 def find_warnings(problem: Problem, setup: Setup) -> list[Mistake]:
-    """Return suspicious values of a problem: a home pose nearer than ``safe``, a target at an obstacle.
+    """Return suspicious values of a problem: a home pose nearer than ``safe``, a target at an obstacle, weak joints.
 
-    Neither is impossible: the resolver moves the arm away from obstacles too near at home, and a tip of three nodes may
-    surround an obstacle with its centre inside.
+    None of them is impossible: the resolver moves the arm away from what is too near at home, and a tip of three nodes
+    may surround an obstacle with its centre inside.
     """
     certain = {mistake.key for mistake in check_problem(problem, setup)}
     near = [mistake for distance, mistake in _at_home(problem, setup) if distance > 0.0]
     doubtful = [mistake for mistake in _inside_obstacles(problem, setup, 0.0) if mistake.key not in certain]
-    return [*near, *doubtful, *excess_of_freedom(problem, setup)]
+    weak = [*_weak_joints(problem, setup), *_joints_without_rate(problem)]
+    return [*near, *doubtful, *weak, *excess_of_freedom(problem, setup)]
+
+
+def _joints_without_rate(problem: Problem) -> Iterator[Mistake]:
+    """Yield the URDF file whose joints have no velocity, or 0, which means no limit."""
+    if problem.arm is None or problem.arm.urdf is None:
+        return
+    names = [joint.name for joint in problem.arm.joint if joint.rate is None and joint.mimic is None]
+    if names:
+        several = f"joints {', '.join(names)}" if len(names) > 1 else f"joint {names[0]}"
+        expected = f"velocity limits greater than 0 in the file; {several} may move at any rate"
+        yield problem.mistake(("arm", "urdf"), expected)
+
+
+def _weak_joints(problem: Problem, setup: Setup) -> Iterator[Mistake]:
+    """Yield the effort limits of joints that the arm's own weight surpasses at home."""
+    arm = setup.arm
+    if arm.effort is None or not arm.mass:
+        return
+    borne = np.abs(arm.forces(arm.home_configuration, np.zeros(3), gravity=GRAVITY))
+    for k in np.flatnonzero(arm.actuated & (borne > arm.effort)).tolist():
+        expected = (
+            f"{borne[k]:.4g} or more, which joint {arm.quantity_names[k]} bears at home of the arm's weight"
+        )
+        yield problem.mistake(("arm", "joint", k, "effort"), expected)
 
 
 def excess_of_freedom(problem: Problem, setup: Setup) -> Iterator[Mistake]:

@@ -13,11 +13,13 @@ import numpy as np
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.curve.families import make_family
 from vgtm_qp.geometry.bodies import Hull
+from vgtm_qp.problem.urdf import UrdfVisual
 from vgtm_qp.result.manifest import scene_problem
 from vgtm_qp.result.result import Result
 from vgtm_qp.rotation import rotation_from_vector
 from vgtm_qp.verify.arm import Arm, arm_of
 from vgtm_qp.verify.curve import TRACKING_TOLERANCE, greatest_gaps
+from vgtm_qp.view.links import link_surfaces
 
 FIXED_COLOUR = (0.70, 0.72, 0.74)
 OBSTACLE_COLOUR = (0.90, 0.62, 0.0)
@@ -146,13 +148,20 @@ class DrawnHull:
 class Drawing:
     """An arm and its surroundings, ready to be drawn at any configuration.
 
-    `curve_weights` (K, V) are those of points along the curve; K = 0 without a curve.
+    `curve_weights` (K, V) are those of points along the curve; K = 0 without a curve. `directory` is that of the files
+    which the problem, the table `problem`, names.
     """
 
     name: str
     arm: Arm
     curve_weights: Array
     obstacles: tuple[ObstacleMesh, ...]
+    problem: Mapping[str, Any]
+    directory: Path
+
+    def links(self) -> tuple[UrdfVisual, ...]:
+        """Return the surfaces of the arm's links that its URDF file draws; none without it."""
+        return link_surfaces(self.problem, self.arm, self.directory)
 
     @cached_property
     def hulls(self) -> tuple[DrawnHull, ...]:
@@ -276,7 +285,7 @@ def make_drawing(problem: Mapping[str, Any], arm: Arm, vertices: int, directory:
         family = make_family(spec.get("family", "bezier"), vertices, **options)
         weights = family.weights(np.linspace(0.0, 1.0, _CURVE_POINTS))
     obstacles = obstacle_meshes(problem.get("obstacle") or (), Path(directory))
-    return Drawing(str(problem.get("name", "")), arm, weights, obstacles)
+    return Drawing(str(problem.get("name", "")), arm, weights, obstacles, problem, Path(directory))
 
 
 def obstacle_meshes(entries: Sequence[Mapping[str, Any]], directory: Path) -> tuple[ObstacleMesh, ...]:

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from vgtm_qp.arrays import Array
 from vgtm_qp.errors import MissingExtraError
+from vgtm_qp.result.chain import RecordedChain
 from vgtm_qp.view.drawing import (
     CURVE_COLOUR,
     FIXED_COLOUR,
@@ -22,6 +23,7 @@ from vgtm_qp.view.drawing import (
     DrawnHull,
     ObstacleMesh,
 )
+from vgtm_qp.view.links import LinkScene
 
 _FIXED_POINT = 2.0**-12
 """Resolution of recorded coordinates, m: a quarter of a millimetre, so that a recording compresses."""
@@ -65,16 +67,19 @@ class ArmScene:
         Radius of a ball that stands out at the arm, m.
     painted : (M, 3) or None
         Colours of the bodies from the next `move` on, 0 to 1; by default those of ``Drawing.colours``.
+    links : LinkScene or None
+        The links as a URDF file draws them.
     """
 
     painted: Array | None = None
+    links: LinkScene | None = None
 
     def __init__(self, server: Any, drawing: Drawing, nodes: Array, control_vertices: Array) -> None:
         import trimesh
 
         self._server, self._scene, self._drawing = server, server.scene, drawing
         arm, self.unit = drawing.arm, float(drawing.arm.size)
-        self.ball = max(0.085 * self.unit, 1.8 * float(np.median(arm.radius)))
+        self.ball = max((0.3 if drawing.hulls else 0.085) * self.unit, 1.8 * float(np.median(arm.radius)))
         self._scene.set_up_direction("+z")
         self._scene.world_axes.visible = False
         self._add_ground(nodes)
@@ -114,11 +119,34 @@ class ArmScene:
         self._line: Any = None
         self._said: Any = None
         self._obstacles = {_path(mesh): self._add_obstacle(mesh) for mesh in drawing.obstacles}
+        surfaces = drawing.links()
+        if surfaces and isinstance(arm, RecordedChain):
+            self.links = LinkScene(self._scene, arm, surfaces)
+            self.ball = min(self.ball, 0.3 * self.unit)
+            self.show(links=True, bodies=False)
 
-    def move(self, nodes: Array, control_vertices: Array, time: float, *, coarse: bool = False) -> None:
+    def show(self, *, links: bool, bodies: bool) -> None:
+        """Show the links that a URDF file draws, the bodies that are kept clear, or both; without links the bodies."""
+        if self.links is not None:
+            self.links.show(links)
+        drawn = [handle for _, handle in (*self._members, *self._hulls)]
+        for handle in (*drawn, self._nodes):
+            handle.visible = bodies or self.links is None
+            handle.opacity = 0.3 if links and self.links is not None else None
+
+    def move(
+        self,
+        nodes: Array,
+        control_vertices: Array,
+        time: float,
+        *,
+        q: Array | None = None,
+        coarse: bool = False,
+    ) -> None:
         """Show the arm at `nodes` (N, 3) and `control_vertices` (V, 3), m, and obstacles at `time`, s.
 
-        With `coarse` coordinates are rounded to a quarter of a millimetre.
+        Links that a URDF file draws are put where they are at the configuration `q`. With `coarse` coordinates are
+        rounded to a quarter of a millimetre.
         """
 
         def numbers(array: Array) -> NDArray[np.float32]:
@@ -146,6 +174,8 @@ class ArmScene:
                 if tuple(surface.color) != (colour := tuple(_rgb(shown[hull.body]).tolist())):
                     surface.color = colour
             self._nodes.batched_positions = numbers(nodes[self._drawing.marks])
+            if self.links is not None and q is not None:
+                self.links.move(q, _FIXED_POINT if coarse else 0.0)
             if self._curve is not None and self._polygon is not None and self._vertices is not None:
                 self._curve.points = numbers(_segments(self._drawing.curve(control_vertices)))
                 self._polygon.points = numbers(_segments(control_vertices))

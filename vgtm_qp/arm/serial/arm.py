@@ -50,10 +50,11 @@ class SerialArm(JointSpaceArm):
         self.chain = chain if spec.every else replace(chain, every=self._every(chain))
         self.functions, self.constants = self.chain.functions, self.chain.constants
         self.movers = self.chain.movers
+        self.mass, self.weight = float(chain.mass.sum()), chain.weight
         self.revolute, self.reaches = chain.revolute, self._reaches()
         self.actuator_units = tuple("rad" if turns else "m" for turns in self.revolute[self.actuated])
         self._place_stations(spec.tip_rotation_vector)
-        if spec.body is None:
+        if not spec.body:
             self._vertices, self.bodies = None, self._links(spec.link_radius)
             return
         sides = zip(spec.body, hulls, strict=True)
@@ -66,6 +67,7 @@ class SerialArm(JointSpaceArm):
         self.stroke = np.array([joint.limits or (-np.inf, np.inf) for joint in joints], dtype=float)
         self.rate = _or_infinite([joint.rate for joint in joints])
         self.acceleration = _or_infinite([joint.acceleration for joint in joints])
+        self.effort = _or_infinite([joint.effort for joint in joints])
         rules = [(k, joint.mimic) for k, joint in enumerate(joints) if joint.mimic is not None]
         self.followers = tuple(Follower(k, number[rule.joint], rule.multiplier) for k, rule in rules)
         for (k, rule), (_, other, factor) in zip(rules, self.followers, strict=True):
@@ -124,9 +126,7 @@ class SerialArm(JointSpaceArm):
         frames = frames_along(self.home[origins])
         trackable = ("position",) if self._can_hold(jacobian[origins[1:]]) else ()
         self.stations = Stations(nodes, weights, frames, trackable, word="joint")
-        frame = (
-            frames[-1] if tip_turn is None else self.chain.attitude(self.home_configuration[:-6], tip_turn)
-        )
+        frame = frames[-1] if tip_turn is None else self.chain.attitude(self.home_configuration, tip_turn)
         self.end_effector = Tip(nodes[-1], weights[-1], frame)
 
     def _reaches(self) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 
@@ -44,6 +44,8 @@ class SerialChain:
         Numbers of joints that move them: 0 in the base's frame.
     beyond : (P,)
         Greatest distance of the body that each point spans, without its radius, from the origin of that frame, m.
+    mass, center : (J,), (J, 3)
+        Masses of what each joint moves and the next one does not, kg, and their centres in its frame, m.
     """
 
     revolute: Mask
@@ -55,6 +57,8 @@ class SerialChain:
     points: Array
     carriers: Index
     beyond: Array
+    mass: Array
+    center: Array
 
     @classmethod
     def of(cls, spec: ArmTable, hulls: Sequence[Hull | None]) -> SerialChain:
@@ -80,6 +84,8 @@ class SerialChain:
             points=np.array([point for point, _, _ in carried], dtype=float).reshape(-1, 3),
             carriers=np.array([carrier for _, carrier, _ in carried], dtype=np.int64),
             beyond=np.array([beyond for _, _, beyond in carried], dtype=float),
+            mass=np.array([joint.mass for joint in joints]),
+            center=np.array([joint.center_of_mass for joint in joints], dtype=float),
         )
 
     def __len__(self) -> int:
@@ -177,12 +183,31 @@ class SerialChain:
         places = [0, *range(len(self)), len(self), *self.carriers, *np.repeat(stations, 2)]
         return np.array(places, dtype=np.int64)
 
-    def attitude(self, joints: Array, turn: Sequence[float]) -> Array:
-        """Return (3, 3) the rotation, in the base's frame, of the last frame turned by the vector `turn`."""
-        frame = np.eye(3)
-        for value, axis, rotation, turns in zip(joints, self.axis, self.rotation, self.revolute, strict=True):
-            frame = frame @ rotation @ rotation_from_vector(value * axis if turns else np.zeros(3))
-        return np.asarray(frame @ rotation_from_vector(turn))
+    def _frames(self, q: Array) -> Iterator[tuple[Array, Array, Array, Array]]:
+        """Yield place and direction (3,) of each joint's axis, origin (3,) and frame (3, 3) after it."""
+        origin, frame = q[-6:-3], rotation_from_vector(q[-3:])
+        for value, axis, position, rotation, turns in zip(
+            q[:-6], self.axis, self.position, self.rotation, self.revolute, strict=True
+        ):
+            place, frame = origin + frame @ position, frame @ rotation
+            direction = frame @ axis
+            origin = place if turns else place + value * direction
+            frame = frame @ rotation_from_vector(value * axis) if turns else frame
+            yield place, direction, origin, frame
+
+    def attitude(self, q: Array, turn: Sequence[float]) -> Array:
+        """Return (3, 3) the rotation of the last frame turned by the vector `turn`."""
+        return np.asarray([*self._frames(q)][-1][-1] @ rotation_from_vector(turn))
+
+    def weight(self, q: Array, gravity: Array) -> Array:
+        """Return (J,) what gravity (3,), m/s^2, exerts about the joints' axes, N m, or along them, N."""
+        places, directions, origins, frames = (np.array(part) for part in zip(*self._frames(q), strict=True))
+        centers = origins + np.einsum("jab,jb->ja", frames, self.center)
+        beyond = np.cumsum(self.mass[::-1])[::-1, None]
+        moments = np.cumsum((self.mass[:, None] * centers)[::-1], axis=0)[::-1]
+        turning = np.cross(moments - beyond * places, gravity)
+        exerted = np.where(self.revolute[:, None], turning, beyond * gravity)
+        return np.asarray(np.einsum("ja,ja->j", directions, exerted))
 
     def at(self, q: Array) -> tuple[Array, Array]:
         """Return nodes (N, 3), m, and Jacobian (N, 3, J) at a configuration."""

@@ -114,7 +114,7 @@ class TrussArm(Arm):
         truss = self.truss
         return None if truss.joints is None else EndKinematics(truss.members, truss.joints)
 
-    def forces(self, q: Array, load: Array) -> Array:
+    def forces(self, q: Array, load: Array, gravity: Array | None = None) -> Array:  # noqa: ARG002
         at_nodes, tip = np.zeros_like(self.home), self.end_effector
         at_nodes[tip.nodes] = tip.weights[:, None] * load
         jacobian = self.truss.scatter.sparse(length_gradients(self.truss, q))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,10 +13,15 @@ from numpy.typing import NDArray
 from vgtm_qp.errors import nearest
 from vgtm_qp.problem.fields import quoted
 from vgtm_qp.problem.urdf.frames import AT_REST, Frame, Origins, after, inverse
+from vgtm_qp.problem.urdf.inertials import WEIGHTLESS, Mass, mass_of
 from vgtm_qp.problem.urdf.shapes import Shapes
 from vgtm_qp.problem.urdf.text import Element, Mistakes, read_xml
+from vgtm_qp.problem.urdf.visuals import UrdfVisual, surfaces_of
 
 Array = NDArray[np.float64]
+
+Place = tuple[int, Frame]
+"""Number of moving joints before a link, and its frame in that of the last of these."""
 
 _MOVING = ("revolute", "continuous", "prismatic")
 _OTHER = ("fixed", "floating", "planar")
@@ -39,6 +44,10 @@ class UrdfJoint:
     limits : (float, float) or None
         rad or m; None for a continuous joint.
     rate, effort : float or None
+    mass : float
+        Of the links that it moves and the joint beyond it does not, kg.
+    center_of_mass : (3,)
+        Their centre in its frame, m.
     mimic : (str, float, float) or None
         Name of the joint that it follows, multiplier and offset. That joint is one of the arm, and follows
         none.
@@ -52,6 +61,8 @@ class UrdfJoint:
     limits: tuple[float, float] | None
     rate: float | None
     effort: float | None
+    mass: float
+    center_of_mass: Array
     mimic: tuple[str, float, float] | None
 
 
@@ -135,11 +146,37 @@ def read_urdf(
     tree = _Tree(read_xml(path), mistakes)
     base, tip = tree.ends(base_link, tip_link)
     chain = tree.chain(base, tip)
-    joints, tip_frame = tree.moving(chain)
+    places, notes = tree.places(chain, base)
+    joints, tip_frame = tree.moving(chain, places)
     shapes = Shapes(path.absolute(), [Path(place).absolute() for place in package_path], mistakes, bodies)
-    found, notes = tree.bodies(chain, base, shapes)
+    found, bare = tree.bodies(places, shapes)
     mistakes.stop()
-    return UrdfArm(joints, *tip_frame, found, base, tip, notes, (path, *shapes.files))
+    return UrdfArm(joints, *tip_frame, found, base, tip, (*notes, *bare), (path, *shapes.files))
+
+
+def read_visuals(
+    file: str | Path,
+    *,
+    base_link: str | None = None,
+    tip_link: str | None = None,
+    package_path: Sequence[str | Path] = (),
+) -> tuple[tuple[UrdfJoint, ...], tuple[UrdfVisual, ...]]:
+    """Return the joints of the arm of :func:`read_urdf`, and what is drawn of its links.
+
+    Shapes whose files are missing or damaged are left out. ProblemError where joints cannot be read.
+    """
+    path = Path(file)
+    mistakes = Mistakes(path)
+    tree = _Tree(read_xml(path), mistakes)
+    base, tip = tree.ends(base_link, tip_link)
+    chain = tree.chain(base, tip)
+    places, _ = tree.places(chain, base)
+    joints, _ = tree.moving(chain, places)
+    mistakes.stop()
+    shapes = Shapes(
+        path.absolute(), [Path(place).absolute() for place in package_path], mistakes, "primitives"
+    )
+    return joints, tuple(tree.visuals(places, shapes))
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,7 +288,10 @@ class _Tree:
         assert joints is not None
         for joint in joints:
             if joint.kind not in (*_MOVING, "fixed"):
-                expected = "a joint of the arm that turns or slides about one axis, or none"
+                expected = (
+                    "a joint of the arm that turns or slides about one axis, or none; "
+                    f'base_link = "{joint.child}" begins behind it'
+                )
                 self._mistakes.add(joint.element, f'joint "{joint.name}", type', joint.kind, expected)
         if not any(joint.moves for joint in joints):
             self._wrong("<robot>", None, f'joints that move between "{base}" and "{tip}"')
@@ -293,28 +333,35 @@ class _Tree:
             seen.append(other)
             joint = joints[other]
 
-    def moving(self, chain: Sequence[_Joint]) -> tuple[tuple[UrdfJoint, ...], Frame]:
+    def moving(
+        self, chain: Sequence[_Joint], places: Mapping[str, Place]
+    ) -> tuple[tuple[UrdfJoint, ...], Frame]:
         """Return the moving joints of the chain, each in the frame of the one before, and the tip in the last."""
-        found, frame = [], AT_REST
+        found, frame, masses = list[UrdfJoint](), AT_REST, self._masses(places)
         for joint in chain:
             frame = after(frame, self._origins.of(joint.element, f'joint "{joint.name}"'))
             if joint.moves:
-                found.append(self._moving(joint, frame))
+                found.append(self._moving(joint, frame, masses.get(len(found) + 1, WEIGHTLESS)))
                 frame = AT_REST
         return tuple(found), frame
 
-    def bodies(
-        self, chain: Sequence[_Joint], base: str, shapes: Shapes
-    ) -> tuple[tuple[UrdfBody, ...], tuple[str, ...]]:
-        """Return bodies of the chain's links and those fixed to them, and notes of what is left out."""
-        places, number, frame, link = {base: (0, AT_REST)}, 0, AT_REST, base
+    def _masses(self, places: Mapping[str, Place]) -> dict[int, Mass]:
+        """Return what links weigh together, by the number of moving joints before them."""
+        found: dict[int, Mass] = {}
+        for link, (number, frame) in places.items():
+            own = mass_of(self._links[link], f'link "{link}"', frame, self._origins, self._mistakes)
+            found[number] = found.get(number, WEIGHTLESS) + own
+        return found
+
+    def places(self, chain: Sequence[_Joint], base: str) -> tuple[dict[str, Place], tuple[str, ...]]:
+        """Return where the chain's links and those fixed to them are, and notes of what is left out."""
+        places, number, frame = {base: (0, AT_REST)}, 0, AT_REST
         for joint in chain:
             frame = after(frame, self._origins.of(joint.element, f'joint "{joint.name}"'))
             if joint.moves:
                 number, frame = number + 1, AT_REST
-            link = joint.child
-            places[link] = (number, frame)
-        on_chain, notes, waiting = {joint.name for joint in chain}, [], list(places)
+            places[joint.child] = (number, frame)
+        on_chain, notes, waiting = {joint.name for joint in chain}, list[str](), list(places)
         while waiting:
             link = waiting.pop(0)
             number, frame = places[link]
@@ -329,7 +376,13 @@ class _Tree:
                 origin = self._origins.of(joint.element, f'joint "{joint.name}"')
                 places[other] = number, after(frame, origin if other == joint.child else inverse(origin))
                 waiting.append(other)
-        bodies: list[UrdfBody] = []
+        return places, tuple(notes)
+
+    def bodies(
+        self, places: Mapping[str, Place], shapes: Shapes
+    ) -> tuple[tuple[UrdfBody, ...], tuple[str, ...]]:
+        """Return bodies of links at their places, and notes of links that have none."""
+        bodies, notes = list[UrdfBody](), list[str]()
         for link, (number, frame) in places.items():
             element = self._links[link]
             if not element.all("collision") and element.all("visual"):
@@ -337,6 +390,13 @@ class _Tree:
             bodies += self._bodies(link, number, frame, shapes)
         bodies.sort(key=lambda body: body.joint)
         return tuple(bodies), tuple(notes)
+
+    def visuals(self, places: Mapping[str, Place], shapes: Shapes) -> Iterator[UrdfVisual]:
+        """Yield what is drawn of links at their places."""
+        for link, (number, frame) in places.items():
+            for visual in self._links[link].all("visual"):
+                at = after(frame, self._origins.of(visual, f'link "{link}", <visual>'))
+                yield from surfaces_of(visual, number, at, shapes, self._root)
 
     def _beside(self, link: str) -> list[_Joint]:
         """Return the joints of a link: to its children and to its parent."""
@@ -355,12 +415,12 @@ class _Tree:
                 found.append(UrdfBody(name, number, origin + points @ turn.T, radius))
         return found
 
-    def _moving(self, joint: _Joint, frame: Frame) -> UrdfJoint:
+    def _moving(self, joint: _Joint, frame: Frame, mass: Mass) -> UrdfJoint:
         """Return a joint of the chain with its axis and limits."""
         axis = _axis(joint, self._mistakes)
         limits, rate, effort = _limits(joint, self._mistakes)
         kind = "prismatic" if joint.kind == "prismatic" else "revolute"
-        return UrdfJoint(joint.name, kind, axis, *frame, limits, rate, effort, self._mimic(joint))
+        return UrdfJoint(joint.name, kind, axis, *frame, limits, rate, effort, *mass, self._mimic(joint))
 
     def _named(self, tag: str) -> dict[str, Element]:
         """Return the links or joints by name."""

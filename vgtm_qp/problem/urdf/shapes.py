@@ -96,12 +96,12 @@ class Shapes:
             self._mistakes.add(shape, f"{what} scale", shape.attributes["scale"], expected)
             return None
         tried = list(self._places(name))
-        file = next((path for path in tried if _is_file(path)), None)
+        file = self.found(name)
         if file is None:
             places = ", ".join(str(path) for path in tried[:4])
-            self._mistakes.add(
-                shape, f"{what} filename", name, f"a file that exists; there is none at {places}"
-            )
+            more = "; package_path of the problem adds places" if name.startswith("package://") else ""
+            expected = f"a file that exists; there is none at {places}{more}"
+            self._mistakes.add(shape, f"{what} filename", name, expected)
             return None
         if file not in self._meshes:
             try:
@@ -111,6 +111,10 @@ class Shapes:
                 return None
             self.files.append(file)
         return np.asarray(self._meshes[file] * np.array(scale))
+
+    def found(self, name: str) -> Path | None:
+        """Return the file of a mesh by its name in the URDF, None if there is none."""
+        return next((path for path in self._places(name) if _is_file(path)), None)
 
     def _places(self, name: str) -> list[Path]:
         """Return the paths at which the file of a mesh may be, in the order of search."""
@@ -122,7 +126,8 @@ class Shapes:
         places = [path / part for path in self._packages for part in (rest, inner)]
         for folder in (beside, *beside.parents):
             places += [folder / rest] + ([folder / inner] if folder.name == package else [])
-        return places
+        # The folder of a package may have been renamed: URDF files are in it, or in a folder of it.
+        return [*places, beside / inner, beside.parent / inner]
 
 
 def _read_mesh(file: Path) -> Array:
@@ -136,7 +141,7 @@ def _read_mesh(file: Path) -> Array:
         # By default trimesh silently skips COLLADA parts with broken references.
         how = {".dae": {"ignore_broken": False}, ".obj": {"skip_materials": True}}
         mesh = trimesh.load(file, force="mesh", **how.get(file.suffix.lower(), {}))
-        mesh.apply_scale(_unit(file))
+        mesh.apply_scale(mesh_unit(file))
         points = np.asarray(mesh.vertices, dtype=float).reshape(-1, 3)
     except Exception as error:  # trimesh raises whatever the reader of the format raises
         raise ProblemError.at(file, "file", "", f"an STL, OBJ or DAE file; {str(error)[:200]}") from None
@@ -148,7 +153,7 @@ def _read_mesh(file: Path) -> Array:
         return points
 
 
-def _unit(file: Path) -> float:
+def mesh_unit(file: Path) -> float:
     """Return the unit of length of a mesh file, m: COLLADA files have one, which trimesh does not apply."""
     if file.suffix.lower() != ".dae":
         return 1.0

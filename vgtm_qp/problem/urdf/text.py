@@ -36,6 +36,9 @@ _KNOWN: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ("name", "type"),
     ),
     "collision": (("origin", "geometry"), ("name",)),
+    "inertial": (("origin", "mass", "inertia"), ()),
+    "mass": ((), ("value",)),
+    "inertia": ((), ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")),
     "origin": ((), ("xyz", "rpy")),
     "axis": ((), ("xyz",)),
     "limit": ((), ("lower", "upper", "velocity", "effort", "acceleration", "deceleration", "jerk")),
@@ -52,7 +55,18 @@ _KNOWN: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 """Of each element the known elements inside it, and its known attributes; other elements are not checked."""
 _ALIKE = 0.65
 """Least similarity of a misspelt name: "xzy" counts, but "kinematic", which is in use, not as "inertial"."""
-_ONCE = ("origin", "parent", "child", "axis", "limit", "mimic", "geometry")
+_ONCE = (
+    "origin",
+    "parent",
+    "child",
+    "axis",
+    "limit",
+    "mimic",
+    "geometry",
+    "inertial",
+    "mass",
+    "inertia",
+)
 """Elements that may stand at most once inside another."""
 
 
