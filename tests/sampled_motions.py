@@ -12,7 +12,10 @@ from pathlib import Path
 
 import numpy as np
 from geometry_reference import POINT
+from scipy.spatial import ConvexHull, cKDTree
 
+GRID = 6
+"""Parts of the edge of a hull's face, with a point at each corner of their grid."""
 BETWEEN, AT = 1e-4, 1e-9
 """Published tolerances of a clearance: between states, over the mean link, and at states, m."""
 
@@ -30,8 +33,32 @@ def turn(vector):
     return turns(np.array([vector], dtype=float))[0]
 
 
-def capsules(table, joints, time):
-    """Ends (S, B, 2, 3), m, and radii (B,) of bodies at joint values (S, J) and times (S,); of an ``[arm]`` table."""
+def surface(points):
+    """Points (K, 3) all over the surface of the convex hull of points (V, 3), on a grid over each of its faces."""
+    corners = np.array(points)[ConvexHull(points).simplices]
+    grid = np.array([(i, j) for i in range(GRID + 1) for j in range(GRID + 1 - i)]) / GRID
+    weights = np.column_stack([grid, 1.0 - grid.sum(axis=1)])
+    return np.unique((weights @ corners).reshape(-1, 3).round(12), axis=0)
+
+
+class Cloud:
+    """A hull as points of its surface, which are fixed in frames: places (S, 3) and attitudes (S, 3, 3)."""
+
+    def __init__(self, points, frame):
+        self.own, (self.place, self.attitude) = surface(points), frame
+        self.middle = np.mean(points, axis=0)
+        self.reach = float(np.linalg.norm(np.array(points) - self.middle, axis=1).max())
+
+    def at(self, rows):
+        """The points (R, K, 3) at some instants."""
+        return self.place[rows, None] + self.own @ np.swapaxes(self.attitude[rows], 1, 2)
+
+
+def bodies_of(table, joints, time):
+    """Ends (S, B, 2, 3), m, radii (B,), and hulls by number, at joint values (S, J) and times (S,).
+
+    The ends of a hull are twice its middle.
+    """
     R, place = np.tile(np.eye(3), (len(joints), 1, 1)), np.zeros((len(joints), 3))
     if table["base_motion"]:
         (pose,) = table["base_motion"]
@@ -50,16 +77,21 @@ def capsules(table, joints, time):
         frames[joint["name"]] = place, R
     places.append(place + R @ table["tip"])
     if table.get("body"):
-        ends = []
-        for body in table["body"]:
+        ends, clouds = [], {}
+        for k, body in enumerate(table["body"]):
             at, attitude = frames[body["joint"]]
-            ends.append([at + attitude @ point for point in (body["points"][0], body["points"][-1])])
-        return np.moveaxis(np.array(ends), 2, 0), np.array([body["radius"] for body in table["body"]])
+            points = body["points"][0], body["points"][-1]
+            if len(body["points"]) > 2:
+                clouds[k] = Cloud(body["points"], (at, attitude))
+                points = [clouds[k].middle] * 2
+            ends.append([at + attitude @ point for point in points])
+        radii = np.array([body["radius"] for body in table["body"]])
+        return np.moveaxis(np.array(ends), 2, 0), radii, clouds
     ways = [*(joint["position"] for joint in table["joint"][1:]), table["tip"]]
     kinds = [joint["kind"] for joint in table["joint"]]
     kept = [k for k, way in enumerate(ways) if any(way) or kinds[k] == "prismatic"]
     ends = np.array([[places[k], places[k + 1]] for k in kept])
-    return np.moveaxis(ends, 2, 0), np.full(len(kept), table["link_radius"])
+    return np.moveaxis(ends, 2, 0), np.full(len(kept), table["link_radius"]), {}
 
 
 def mean_link(table):
@@ -127,6 +159,32 @@ def from_segment(one, other):
     return least
 
 
+def from_cloud(points, distance):
+    """Distances (S,) of points (S, K, 3) from a solid: no less than that of their hull."""
+    return distance(points.reshape(-1, 3)).reshape(points.shape[:2]).min(axis=1)
+
+
+def between_clouds(one, other):
+    """Distances (S,) of points (S, K, 3) from points (S, L, 3)."""
+    return np.array([cKDTree(a).query(b)[0].min() for a, b in zip(one, other, strict=True)])
+
+
+def between_bodies(one, other, ends):
+    """Distances (S,) of two bodies, clouds or None, the latter with `ends` (S, 2, 3) each."""
+    if one is None and other is None:
+        return from_segment(*ends)
+    if one is not None and other is not None:
+        return between_clouds(one, other)
+    cloud, (a, b) = (
+        (one, np.moveaxis(ends[1], 1, 0)) if other is None else (other, np.moveaxis(ends[0], 1, 0))
+    )
+    way = b - a
+    off = cloud - a[:, None]
+    square = np.maximum((way * way).sum(axis=1), 1e-300)
+    share = np.clip(np.einsum("skc,sc->sk", off, way) / square[:, None], 0.0, 1.0)
+    return np.linalg.norm(off - share[..., None] * way[:, None], axis=2).min(axis=1)
+
+
 def spare(maneuver, samples, random):
     """Least clearance over that asked for, m, with its pair and time: at the states, and at random instants between."""
     problem, arm = maneuver.manifest["problem"], maneuver.manifest["arm"]
@@ -155,10 +213,11 @@ def spare(maneuver, samples, random):
         share = np.r_[0.0, 1.0, random.random(samples)]
         time = (1.0 - share) * maneuver.time[k] + share * maneuver.time[k + 1]
         joints = (1.0 - share)[:, None] * maneuver.joints[k] + share[:, None] * maneuver.joints[k + 1]
-        ends, radius = capsules(table, joints, time)
+        ends, radius, clouds = bodies_of(table, joints, time)
         assert ends.shape[1] == len(names)
-        middle, half = ends.mean(axis=2), np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=2) / 2.0
-        low, high = ends.min(axis=(0, 2)), ends.max(axis=(0, 2))
+        reach = np.array([clouds[m].reach if m in clouds else 0.0 for m in range(len(names))])
+        middle, half = ends.mean(axis=2), np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=2) / 2.0 + reach
+        low, high = ends.min(axis=(0, 2)) - reach[:, None], ends.max(axis=(0, 2)) + reach[:, None]
         is_state = share * (1.0 - share) == 0.0
         for distance, size, obstacle in solids:
             moved = time[:, None] * np.array(obstacle["velocity"])
@@ -168,9 +227,13 @@ def spare(maneuver, samples, random):
                 off = np.linalg.norm(middle[:, m] - at, axis=1) - size - half[:, m] - radius[m]
                 near = off < rules["safe"] + 0.01
                 at_rest = ends[:, m] - moved[:, None]
-                near[near] = at_least(distance, at_rest[near]) - radius[m] < rules["safe"] + 0.01
+                if m not in clouds:
+                    near[near] = at_least(distance, at_rest[near]) - radius[m] < rules["safe"] + 0.01
                 if near.any():
-                    found = from_solid(distance, at_rest[near]) - radius[m]
+                    if m in clouds:
+                        found = from_cloud(clouds[m].at(near) - moved[near, None], distance) - radius[m]
+                    else:
+                        found = from_solid(distance, at_rest[near]) - radius[m]
                     note(found, rules["safe"], f"{names[m]} / {obstacle['name']}", time[near], is_state[near])
         for m, j in pairs:
             box = np.maximum(np.maximum(low[m] - high[j], low[j] - high[m]), 0.0)
@@ -179,7 +242,8 @@ def spare(maneuver, samples, random):
                 off = np.linalg.norm(middle[:, m] - middle[:, j], axis=1) - half[:, m] - half[:, j] - thick
                 near = off < self_safe + 0.01
                 if near.any():
-                    found = from_segment(ends[near, m], ends[near, j]) - thick
+                    own = [clouds[k].at(near) if k in clouds else None for k in (m, j)]
+                    found = between_bodies(*own, (ends[near, m], ends[near, j])) - thick
                     note(found, self_safe, f"{names[m]} / {names[j]}", time[near], is_state[near])
     return least
 

@@ -99,11 +99,22 @@ def _chain(random: np.random.Generator) -> dict[str, Any]:
             }
             for k, (joint, place) in enumerate(zip(joints, places, strict=True))
         ]
+        if random.random() < 0.5:
+            for body in table["body"]:
+                body["points"] = _hull(random, np.array([body["points"][0], body["points"][-1]]))
+                body["radius"] *= float(random.random() < 0.3)
     if random.random() < 0.3:
         table["tip_rotation_vector"] = (0.5 * random.normal(size=3)).tolist()
     if random.random() < 0.2:
         table["every"] = int(random.integers(1, len(joints)))
     return table
+
+
+def _hull(random: np.random.Generator, ends: Array) -> list[list[float]]:
+    """Return points of a hull about the axis between two `ends` (2, 3), m: some at each end, at random aside."""
+    count = int(random.integers(2, 7))
+    points = np.repeat(ends, count, axis=0) + 0.04 * random.normal(size=(2 * count, 3))
+    return [[float(x) for x in point] for point in points]
 
 
 def _joint(random: np.random.Generator, number: int) -> dict[str, Any]:
