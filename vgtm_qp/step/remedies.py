@@ -193,7 +193,8 @@ def resorts(
     if 1 < len(changes) <= MOST:
         yield Remedy(tuple(changes.values()), 1.0)
     arm = setup.arm
-    middle = dict(zip(arm.quantity_names, quantities > arm.stroke.mean(axis=1), strict=True))
+    is_beyond = quantities - arm.stroke[:, 0] > arm.stroke[:, 1] - quantities
+    middle = dict(zip(arm.quantity_names, is_beyond, strict=True))
     each = (limit_of(setup, name, bool(middle.get(name.partition(": ")[2], True))) for name in names)
     limits = list(dict.fromkeys(limit for limit in each if limit is not None))
     first = [_first_try(setup, limit) for limit in limits[:MOST]]
