@@ -2,10 +2,12 @@
 
 import numpy as np
 import pytest
+import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+import vgtm_qp as vq
 from vgtm_qp.geometry import shapes
 from vgtm_qp.geometry.bodies import Hull, convex_bodies
 from vgtm_qp.geometry.clearance import Clearance
@@ -242,3 +244,51 @@ def test_a_simplex_search_agrees_with_least_squares(seed):
                 m = n + rng.normal(size=3) * 10.0 ** rng.uniform(-6.0, 0.0)
                 m /= np.linalg.norm(m)
                 assert (a @ m).min() - (b @ m).max() <= distance + 1e-9
+
+
+def test_distances_from_cylinders_agree_to_the_last_digits():
+    rng = np.random.default_rng(3)
+    corners = np.array(np.meshgrid(*[(-0.5, 0.5)] * 3)).reshape(3, -1).T
+    hulls = [Hull.of(corners * rng.uniform(0.05, 0.3, size=3)) for _ in range(200)]
+    names = [str(k) for k in range(len(hulls))]
+    points = np.arange(4 * len(hulls)).reshape(-1, 4).tolist()
+    bodies = convex_bodies(points, hulls, 0.0, names, joints=np.zeros((len(hulls), 2), dtype=int))
+    post = shapes.cylinder("post", (0.0, 0.0, 0.0), 0.1, 0.3)
+    monitor = Clearance(bodies, [post], safe=0.0, influence=10.0, self_collision=False, by_fcl=False)
+    poses = [(turn(rng), rng.normal(size=3) * 0.25) for _ in hulls]
+    X = np.vstack([hull.simplex @ R.T + t for hull, (R, t) in zip(hulls, poses, strict=True)])
+    contacts = monitor.near(X, 0.0, 10.0)
+    vertices = np.array([hull.weights @ X[own] for hull, own in zip(hulls, points, strict=True)])
+    shape = recorded.cylinder(0.1, 0.15)
+    found, _ = shape.hull_distance(vertices, np.tile(shape.sizes, (len(hulls), 1)))
+    least = {pair.body: distance for pair, (distance, _) in least_rows(contacts).items()}
+    apart = [body for body, distance in least.items() if distance > 1e-6]
+    assert len(apart) > 100
+    np.testing.assert_allclose(found[apart], [least[body] for body in apart], rtol=0.0, atol=5e-12)
+
+
+def test_a_hull_inside_a_closed_mesh_is_not_clear_even_where_touching_is(tmp_path):
+    corners = np.array(np.meshgrid([-0.05, 0.05], [-0.05, 0.05], [0.1, 0.2])).reshape(3, -1).T
+    joints = [
+        {"name": f"j{k}", "axis": axis, "position": [0.0, 0.0, 0.3 if k else 0.0], "home": 0.4}
+        for k, axis in enumerate([[0, 1, 0], [1, 0, 0], [0, 1, 0], [1, 0, 0]])
+    ]
+    data = {
+        "schema_version": 1,
+        "arm": {
+            "joint": joints,
+            "tip": [0.0, 0.0, 0.3],
+            "body": [{"name": "block", "joint": "j2", "points": corners.tolist()}],
+        },
+        "maneuver": {"steps": 1, "waypoint": [{"time": 1.0, "position": [0.5, -0.4, 0.9]}]},
+        "clearance": {"safe": 0.0},
+        "method": {"tracking": "none"},
+    }
+    maneuver = vq.solve(vq.Problem.from_dict(data))
+    assert maneuver.certificate.ok
+    file = tmp_path / "shell.stl"
+    trimesh.creation.box((2.0, 2.0, 2.0)).export(file)
+    shell = {"name": "shell", "shape": "mesh", "file": str(file), "center": [0.0, 0.0, 0.5]}
+    certificate = vq.verify(maneuver, problem=vq.Problem.from_dict(data | {"obstacle": [shell]}))
+    assert not certificate.clearance.ok
+    assert certificate.clearance.value <= -0.1 * np.sqrt(3.0)

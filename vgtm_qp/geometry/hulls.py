@@ -335,7 +335,12 @@ def _nearest(
         own, others = np.vstack([own, a]), np.vstack([others, b])
         apart = own - others
         scale = max(float(np.abs(apart).max()), np.finfo(float).tiny)
-        weights, _ = nnls(np.vstack([apart.T / scale, np.ones(len(apart))]), np.array([0.0, 0.0, 0.0, 1.0]))
+        try:
+            weights, _ = nnls(
+                np.vstack([apart.T / scale, np.ones(len(apart))]), np.array([0.0, 0.0, 0.0, 1.0])
+            )
+        except RuntimeError:  # it gives up; the normal so far proves a distance all the same
+            break
         kept = weights > 0.0
         own, others, weights = own[kept], others[kept], weights[kept] / weights.sum()
         x, y = weights @ own, weights @ others

@@ -266,10 +266,10 @@ class AgainstBody(Encounters):
         return np.repeat(member, [len(found) for found in near]), np.concatenate(near)
 
     def at_state(self, state: int) -> Least:
-        """Return the exact least clearance at a state; a member inside a closed mesh counts as touching."""
-        ends = self.motion.ends[state] - self._centers[state]
+        """Return the exact least clearance at a state; what is inside a closed mesh touches, hulls by their length."""
+        arm, ends = self.motion.arm, self.motion.ends[state] - self._centers[state]
         inside = self.body.encloses(ends.reshape(-1, 3)).reshape(len(ends), -1).any(axis=1)
-        depth = np.where(inside, -self.motion.arm.radius, np.inf)
+        depth = np.where(inside, -np.where(arm.is_hull, arm.length, 0.0) - arm.radius, np.inf)
         return (
             super()
             .at_state(state)

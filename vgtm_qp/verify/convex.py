@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import nnls
 
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.verify.distance import Separation
@@ -24,6 +25,8 @@ _EXACT = 1e-13
 """Gap between upper and lower bound of a distance that ends the search, over the size of what is far from what."""
 _TOUCHING = 1e-12
 """Distance, over the same size, below which two bodies overlap."""
+_FINISHED, _MOST_MORE = 1e-12, 30
+"""The same gap up to which, and the number of normals along which, a pair is finished one by one."""
 _OTHERS = ((1, 2), (0, 2), (0, 1))
 _SUBSETS: NDArray[np.bool_] = np.array(
     [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 1, 1], [1, 0, 1], [1, 1, 0], [1, 1, 1]], dtype=np.bool_
@@ -65,6 +68,7 @@ def hull_distance(vertices: Array, furthest: Furthest, near: Array | None = None
     length = np.linalg.norm(direction, axis=1)
     normal = np.where(length[:, None] > 0.0, direction / np.maximum(length, 1e-300)[:, None], [0.0, 0.0, 1.0])
     rows, upper = every, np.full(count, np.inf)
+    reached, sizes = np.full((2, count), np.inf)
     corners, used = np.zeros((count, 3, 3)), np.zeros((count, 3), dtype=np.bool_)
 
     def look(along: Array, rows: Index) -> Array:
@@ -87,6 +91,7 @@ def hull_distance(vertices: Array, furthest: Furthest, near: Array | None = None
         )
         weights, point = _nearest(apart, corners, used)
         distance = np.linalg.norm(point, axis=1)
+        reached[rows], sizes[rows] = np.minimum(distance, upper), size
         kept = weights > 0.0
         inside = (distance <= _TOUCHING * size) | kept.all(axis=1)
         overlap[rows[inside]] = True
@@ -104,8 +109,33 @@ def hull_distance(vertices: Array, furthest: Furthest, near: Array | None = None
         corners = np.take_along_axis(every_corner, order[..., None], axis=1)
         used = np.take_along_axis(kept, order, axis=1)
     overlap &= lower <= 0.0
+    for k in np.flatnonzero(~overlap & (reached - lower > _FINISHED * sizes)).tolist():
+        _finish(look, best[k], every[k : k + 1])
     lower[overlap], best[overlap] = _way_out(vertices[overlap], furthest, every[overlap])
     return lower, best
+
+
+def _finish(look: Callable[[Array, Index], Array], normal: Array, row: Index) -> None:
+    """Look along normals of one pair, from its best one (3,) on, until the gap along one of them is its distance.
+
+    Where a simplex has corners close together, as on a rim, the distance is known with the square of the error of
+    the normal, and the simplices end before the gap is as good. Least squares without negative weights do not.
+    """
+    along, corners = normal.copy(), np.zeros((0, 3))
+    for _ in range(_MOST_MORE):
+        corners = np.concatenate([corners, look(along[None], row)])
+        size = max(float(np.abs(corners).max()), 1e-300)
+        system = np.concatenate([corners.T / size, np.ones((1, len(corners)))])
+        try:
+            weights, _ = nnls(system, np.array([0.0, 0.0, 0.0, 1.0]))
+        except RuntimeError:  # it gives up; the gap so far is a bound all the same
+            return
+        corners, weights = corners[weights > 0.0], weights[weights > 0.0]
+        point = weights @ corners / weights.sum()
+        distance = float(np.linalg.norm(point))
+        if distance <= _TOUCHING * size or distance - float((corners @ along).min()) <= _FINISHED * size:
+            return
+        along = point / distance
 
 
 def _way_out(vertices: Array, furthest: Furthest, rows: Index) -> Separation:
