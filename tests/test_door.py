@@ -164,7 +164,7 @@ def moved_by(arm, q, strokes):
 def spanned(arm, q):
     """The points (B, V, 3) whose hulls the bodies are, but for their radii."""
     points = arm.points(q)[arm.bodies.points]
-    return arm.bodies.weights @ points if arm.bodies.hulls else points
+    return arm.bodies.weights_of(np.arange(len(arm.bodies))) @ points if arm.bodies.hulls else points
 
 
 def derivative(arm, q, strokes, function):

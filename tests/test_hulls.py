@@ -292,3 +292,30 @@ def test_a_hull_inside_a_closed_mesh_is_not_clear_even_where_touching_is(tmp_pat
     certificate = vq.verify(maneuver, problem=vq.Problem.from_dict(data | {"obstacle": [shell]}))
     assert not certificate.clearance.ok
     assert certificate.clearance.value <= -0.1 * np.sqrt(3.0)
+
+
+def test_many_vertices_and_many_triangles_are_taken_by_parts(rng):
+    ways = rng.normal(size=(3000, 3))
+    ball = Hull.of(0.3 * ways / np.linalg.norm(ways, axis=1)[:, None])
+    cube = Hull.of(np.array(np.meshgrid(*[(-0.1, 0.1)] * 3)).reshape(3, -1).T)
+    bodies = convex_bodies(
+        [range(4), range(4, 8)], [ball, cube], 0.0, ["ball", "cube"], joints=[[0, 1], [1, 2]]
+    )
+    rock = trimesh.creation.icosphere(2, 0.2)
+    obstacle = shapes.mesh("rock", (rock.vertices, rock.faces), center=(1.0, 0.0, 0.0))
+    away, center = np.array([0.5, 0.6, 0.0]), np.array([1.0, 0.0, 0.0])
+    X = np.vstack([ball.simplex, cube.simplex + away])
+    monitor = Clearance(bodies, [obstacle], safe=0.0, influence=5.0, self_collision=False)
+    # More vertices than are in the memory at a time.
+    assert len(ball.vertices) * len(monitor.pieces) > 500_000
+    contacts = monitor.near(X, 0.0, 5.0)
+    shape, found = recorded.mesh(rock.triangles + center, closed=True), {}
+    for k in range(len(contacts)):
+        pair = contacts.pair(k)
+        found.setdefault((pair.body, pair.other), contacts.distance[k])
+    for body, vertices in enumerate((ball.vertices, cube.vertices + away)):
+        pieces = [piece for own, piece in found if own == body]
+        assert pieces
+        expected, _ = shape.hull_distance(np.tile(vertices, (len(pieces), 1, 1)), shape.sizes[pieces])
+        got = [found[body, piece] for piece in pieces]
+        np.testing.assert_allclose(got, expected, rtol=0.0, atol=2e-6)

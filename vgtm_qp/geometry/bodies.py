@@ -136,15 +136,23 @@ class Bodies:
         return np.array([hull is not None for hull in self.hulls], dtype=bool)
 
     @cached_property
-    def weights(self) -> Array:
-        """(B, V, 4) weights of the four points of each body in its vertices, some of which are repeated."""
-        most = max((len(hull.vertices) for hull in self.hulls if hull is not None), default=_CAPSULE)
-        every = np.arange(most)
+    def counts(self) -> Index:
+        """(B,) numbers of vertices: two for capsules."""
+        hulls = self.hulls or (None,) * len(self)
+        return np.array([_CAPSULE if hull is None else len(hull.vertices) for hull in hulls], dtype=np.int64)
+
+    @cached_property
+    def _weights(self) -> Array:
+        every = np.arange(self.counts.max(initial=_CAPSULE))
         weights = np.tile(np.eye(_HULL)[every % _CAPSULE], (len(self), 1, 1))
         for body, hull in enumerate(self.hulls):
             if hull is not None:
                 weights[body] = hull.weights[every % len(hull.vertices)]
         return weights
+
+    def weights_of(self, body: Index) -> Array:
+        """Return (k, V, 4) weights of the four points of bodies (k,) in their vertices, some of which are repeated."""
+        return self._weights[body, : self.counts[body].max(initial=_CAPSULE)]
 
     @cached_property
     def sizes(self) -> Array:

@@ -28,6 +28,8 @@ from vgtm_qp.geometry.groups import Group, Scene
 
 _POINTS = 12
 """Numbers of the four points that span a body."""
+_AT_ONCE = 200_000
+"""Number of vertices of pairs that are in the memory at a time."""
 _CONTACTS = 3
 """Greatest number of contacts of a pair: for a hull that lies flat on something."""
 _MOST = 60
@@ -73,6 +75,9 @@ class HullGroup(Group):
 
         Further contacts are vertices of a hull that are almost as near; their distances are ``FAR`` without any.
         """
+        return self._in_parts(self._contacts, pairs)
+
+    def _contacts(self, pairs: Array) -> Array:
         sides = _Sides(self, pairs)
         x, y, normal, proven = self._witnesses(pairs, sides)
         low, high = sides.heights(normal)
@@ -93,7 +98,9 @@ class HullGroup(Group):
 
         The least one is exact; others may be too small by the error of FCL's answers that are proven.
         """
-        pairs = self.at(X, time, rows)
+        return self._in_parts(self._distances_of, self.at(X, time, rows))
+
+    def _distances_of(self, pairs: Array) -> Array:
         sides = _Sides(self, pairs)
         _, _, normal, proven = self._witnesses(pairs, sides)
         found = sides.gaps(normal) - pairs[:, -2]
@@ -110,6 +117,9 @@ class HullGroup(Group):
 
     def sweep(self, start: Array, end: Array) -> Array:
         """Return bounds (k, 3) as ``exact.sweep_function``, by a plane that turns from one contact to the next."""
+        return self._in_parts(self._bounds, start, end)
+
+    def _bounds(self, start: Array, end: Array) -> Array:
         sides = [_Sides(self, pairs) for pairs in (start, end)]
         normals = [self._witnesses(*both)[2] for both in zip((start, end), sides, strict=True)]
         (low, high), (low_after, high_after) = (
@@ -131,6 +141,23 @@ class HullGroup(Group):
 
     def _deepest(self, rows: Index) -> Array:
         return np.full(len(rows), -np.inf)
+
+    def _in_parts(self, function: Callable[..., Array], *pairs: Array) -> Array:
+        """Return the rows of a `function` of pairs; of many vertices by parts, pairs with as many of them together."""
+        rows = pairs[0][:, -1].astype(np.int64)
+        counts = self.scene.bodies.counts[self.body[rows]]
+        if self.is_self:
+            counts = np.maximum(counts, self.scene.bodies.counts[self.other[rows]])
+        if len(rows) * int(counts.max(initial=0)) <= _AT_ONCE:
+            return function(*pairs)
+        order = np.argsort(counts, kind="stable")
+        found, first = [], 0
+        while first < len(order):
+            fits = np.arange(1, len(order) - first + 1) * counts[order[first:]] <= _AT_ONCE
+            last = first + max(1, int(fits.argmin()) if not fits.all() else len(fits))
+            found.append(function(*(own[order[first:last]] for own in pairs)))
+            first = last
+        return np.concatenate(found)[np.argsort(order)]
 
     def _witnesses(self, pairs: Array, sides: _Sides) -> tuple[Array, Array, Array, Mask]:
         """Return nearest points (k, 3) of body and other, m, normals (k, 3), and which of them FCL supplied (k,)."""
@@ -220,12 +247,12 @@ class _Sides:
         self._scene, self._shape, self._bodies = scene, group.shape, scene.bodies
         self._body, self._other = group.body[rows], group.other[rows]
         self._points, self._pieces = pairs[:, :_POINTS].reshape(-1, 4, 3), pairs[:, _POINTS:-2]
-        self.weights, self.size = self._bodies.weights[self._body], self._bodies.sizes[self._body]
+        self.weights, self.size = self._bodies.weights_of(self._body), self._bodies.sizes[self._body]
         self.vertices = self.weights @ self._points
         self.is_self = group.is_self
         if self.is_self:
             self._of_other = self._pieces[:, :_POINTS].reshape(-1, 4, 3)
-            self.others = self._bodies.weights[self._other] @ self._of_other
+            self.others = self._bodies.weights_of(self._other) @ self._of_other
 
     def heights(self, normal: Array) -> tuple[Array, Array]:
         """Return heights (k, V) of the vertices along normals (k, 3), and the greatest height (k,) of the others."""
