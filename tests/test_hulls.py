@@ -1,5 +1,7 @@
 """Bodies that are convex hulls: distances, rows, proofs over a motion, and whole problems with them."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 import trimesh
@@ -319,3 +321,28 @@ def test_many_vertices_and_many_triangles_are_taken_by_parts(rng):
         expected, _ = shape.hull_distance(np.tile(vertices, (len(pieces), 1, 1)), shape.sizes[pieces])
         got = [found[body, piece] for piece in pieces]
         np.testing.assert_allclose(got, expected, rtol=0.0, atol=2e-6)
+
+
+def test_a_long_trajectory_of_a_fine_hull_is_certified_in_little_memory(rng):
+    ways = rng.normal(size=(3000, 3))
+    ball = 0.1 * ways / np.linalg.norm(ways, axis=1)[:, None] + [0.5, 0.0, 0.0]
+    data = {
+        "schema_version": 1,
+        "arm": {
+            "joint": [{"name": "hip", "axis": [0, 0, 1]}, {"name": "knee", "axis": [0, 1, 0]}],
+            "tip": [1.0, 0.0, 0.0],
+            "body": [{"name": "ball", "joint": "hip", "points": ball.tolist()}],
+        },
+        "obstacle": [{"name": "post", "shape": "sphere", "center": [0.5, 0.0, 0.4], "radius": 0.2}],
+        "maneuver": {"waypoint": [{"time": 1.0, "position": [0.9, 0.1, 0.0]}]},
+        "clearance": {"safe": 0.02},
+    }
+    certifier, times = vq.Certifier(vq.Problem.from_dict(data)), np.linspace(0.0, 1.0, 2000)
+    tracemalloc.start()
+    verdict = certifier.certify(times, np.stack([np.sin(times), 0.0 * times], axis=1))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert verdict.certified
+    assert 0.09 < verdict.clearance < 0.11
+    # The places of all vertices at all rows are 144 MB, and those of all pairs 288 MB.
+    assert peak < 280e6

@@ -28,7 +28,8 @@ _REPORT_DEPTH = 10
 """Greatest gap between proven bound and least clearance, over the mean link, and halvings to reach it."""
 _INSTANTS = 17
 """Number of instants of a segment at which a pair is measured if it comes too near in the segment."""
-_CHUNK = 500_000
+_POINTS = 2_000_000
+"""Number of points of pairs, or of bodies at instants, that are in the memory at a time, nearly."""
 
 
 @dataclass
@@ -92,6 +93,7 @@ class Bisection:
         floor = kept[0].floor - CLEARANCE_TOLERANCE
         rounding = max(pairs.rounding for pairs in kept)
         self.least, self.most = floor - rounding, floor + rounding
+        self.points = 2 * motion.arm.states_ends(motion.states[:1]).shape[2]
         self.close = _NEAR_ENOUGH * motion.arm.size
         near, self.rest = self._candidates()
         sizes = [len(pairs.gap) for pairs in near]
@@ -120,15 +122,23 @@ class Bisection:
         for own in self.kept:
             one = own.nearest()
             if len(one.gap) and one.gap[0] < nearest:
-                ends, time = self.motion.ends[one.segment], self.motion.time[one.segment]
+                ends = self.motion.arm.states_ends(self.motion.states[one.segment])
+                time = self.motion.time[one.segment]
                 edge = _edge_of(own, one.pair, ends, time, np.zeros(1, dtype=np.int64))
                 nearest = min(nearest, float(edge.distance[0]))
         found = [own.near(max(own.floor, nearest) + own.rounding) for own in self.kept]
         return [near for near, _ in found], min((rest for _, rest in found), default=np.inf)
 
     def run(self, decision: Decision) -> None:
-        """Halve intervals until each is decided, and add the results to `decision`."""
-        pair = np.arange(len(self.segment))
+        """Decide all pairs, and add the results to `decision`."""
+        size = max(1, _POINTS // self.points)
+        for first in range(0, len(self.segment), size):
+            self._halve(np.arange(first, min(first + size, len(self.segment))))
+        self._look_closer()
+        self._tell(decision)
+
+    def _halve(self, pair: Index) -> None:
+        """Halve the intervals of some pairs until each is decided."""
         start, width = np.zeros(len(pair)), 1.0
         first = self._edge(pair, np.zeros(len(pair)))
         last = self._edge(pair, np.ones(len(pair)), first.normal)
@@ -148,8 +158,6 @@ class Bisection:
             start = np.stack([start, start + width], axis=1).reshape(-1)
             pair = np.repeat(pair, 2)
             proven = self._across(pair, first, last)
-        self._look_closer()
-        self._tell(decision)
 
     def _open(self, pair: Index, proven: Array, depth: int) -> NDArray[np.bool_]:
         """Return (I,) which intervals are halved."""
@@ -192,7 +200,7 @@ class Bisection:
         """
         x = self.segment[pair] + share
         instants, which = np.unique(x, return_inverse=True)
-        if len(instants) > 1 and len(instants) * len(self.motion.arm.radius) > _CHUNK:
+        if len(instants) > 1 and len(instants) * len(self.motion.arm.radius) * self.points > _POINTS:
             half = len(pair) // 2
             halves = (slice(half), slice(half, None))
             return _Edge.joined(
@@ -242,7 +250,10 @@ class Bisection:
         """Measure pairs that come too near at more instants: from when to when, and how near."""
         broken = np.flatnonzero(self.found < self.least)[:_GREATEST_COUNT]
         share = np.linspace(0.0, 1.0, _INSTANTS)
-        self._edge(np.repeat(broken, len(share)), np.tile(share, len(broken)))
+        size = max(1, _POINTS // (self.points * len(share)))
+        for first in range(0, len(broken), size):
+            own = broken[first : first + size]
+            self._edge(np.repeat(own, len(share)), np.tile(share, len(own)))
 
     def _tell(self, decision: Decision) -> None:
         """Add the results to `decision`; the same bodies in successive segments make one finding."""

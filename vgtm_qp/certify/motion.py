@@ -31,7 +31,7 @@ class GivenMotion(RecordedMotion):
     def __init__(self, arm: Arm, time: Array, states: Array) -> None:
         super().__init__(arm, time, states)
         steps = 64.0 + 16.0 * len(arm.quantity_names)
-        self.rounding = steps * float(np.finfo(float).eps) * float(np.abs(self.ends).max(initial=0.0))
+        self.rounding = steps * float(np.finfo(float).eps) * self.furthest
 
     @abstractmethod
     def ends_at(self, segment: Index, share: Array) -> Array:
@@ -51,7 +51,7 @@ class JointMotion(GivenMotion):
         super().__init__(arm, time, np.concatenate([joints, base_poses(problem, time)], axis=1))
         self.bends = arm.bend(self.states[:-1], self.states[1:], np.arange(len(arm.member_names)))
         turned = float(np.abs(joints).max(initial=0.0)) * float(np.finfo(float).eps)
-        self.rounding += turned * len(arm.quantity_names) * float(np.abs(self.ends).max(initial=0.0))
+        self.rounding += turned * len(arm.quantity_names) * self.furthest
 
     def ends_at(self, segment: Index, share: Array) -> Array:
         """Return the ends; the base is where the problem has it at that time, not on the chord between two rows."""

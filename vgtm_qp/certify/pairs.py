@@ -41,10 +41,9 @@ class Kept(ABC):
 
     def __init__(self, motion: GivenMotion, kind: str, floor: float) -> None:
         self.motion, self.kind, self.floor, self.rounding = motion, kind, floor, motion.rounding
-        slack = motion.bends[:, :, None] / 8.0
-        ends = motion.ends
-        self._low = np.minimum(ends[:-1], ends[1:]).min(axis=2) - slack
-        self._high = np.maximum(ends[:-1], ends[1:]).max(axis=2) + slack
+        slack, (low, high) = motion.bends[:, :, None] / 8.0, motion.boxes
+        self._low = np.minimum(low[:-1], low[1:]) - slack
+        self._high = np.maximum(high[:-1], high[1:]) + slack
 
     @abstractmethod
     def _gaps(self, segments: slice) -> Array:
@@ -222,11 +221,11 @@ class KeptBodies(Kept):
     def enclosed(self) -> Iterator[tuple[int, tuple[int, int]]]:
         """See ``Kept``: inside a closed mesh."""
         for body, first in zip(self.bodies, self._first.tolist(), strict=False):
-            if body.shape.closed:
-                ends = self.motion.ends - body.at(self.motion.time)[:, None, None]
+            for own, places in self.motion.ends_by_parts() if body.shape.closed else ():
+                ends = places - body.at(self.motion.time[own])[:, None, None]
                 inside = body.encloses(ends.reshape(-1, 3)).reshape(ends.shape[:3]).any(axis=2)
                 for state, member in np.argwhere(inside).tolist():
-                    yield state, (member, first)
+                    yield own.start + state, (member, first)
 
 
 class KeptMembers(Kept):

@@ -35,6 +35,8 @@ _GREATEST_DEPTH = 48
 _GREATEST_COUNT = 400_000
 """Greatest numbers of halvings, and of open intervals; beyond, a bound stays as it is."""
 _CHUNK = 200_000
+_ENDS = 3_000_000
+"""Number of coordinates of ends that are in the memory at a time."""
 
 
 class RecordedMotion:
@@ -46,10 +48,33 @@ class RecordedMotion:
 
     def __init__(self, arm: Arm | CarryingArm, time: Array, states: Array, first: int = 0) -> None:
         self.arm, self.time, self.states, self.first = arm, time, states, first
-        self.ends = arm.states_ends(states)
         # No bound is nearer than the rounding of positions.
-        rounding = 64.0 * float(np.finfo(float).eps) * float(np.abs(self.ends).max(initial=0.0))
+        rounding = 64.0 * float(np.finfo(float).eps) * self.furthest
         self.resolution = max(RESOLUTION * arm.size, rounding)
+
+    @cached_property
+    def ends(self) -> Array:
+        """See the class."""
+        return self.arm.states_ends(self.states)
+
+    def ends_by_parts(self) -> Iterator[tuple[slice, Array]]:
+        """Yield some states after others, and their ends: those of all states may be too much for the memory."""
+        size = max(1, _ENDS // max(1, self.arm.states_ends(self.states[:1]).size))
+        for first in range(0, len(self.states), size):
+            own = slice(first, first + size)
+            yield own, self.arm.states_ends(self.states[own])
+
+    @cached_property
+    def boxes(self) -> tuple[Array, Array]:
+        """Least and greatest corners (T, M, 3) of boxes round the bodies' ends, m."""
+        each = [(ends.min(axis=2), ends.max(axis=2)) for _, ends in self.ends_by_parts()]
+        low, high = zip(*each, strict=True)
+        return np.concatenate(low), np.concatenate(high)
+
+    @property
+    def furthest(self) -> float:
+        """Greatest coordinate of an end, m."""
+        return max(float(np.abs(corners).max(initial=0.0)) for corners in self.boxes)
 
     def part(self, first: int, last: int, arm: Arm | CarryingArm | None = None) -> RecordedMotion:
         """Return the motion from the state `first` to the state `last`, of an `arm` that carries something if given."""
