@@ -45,7 +45,10 @@ class Scene:
             shapes.cylinder("post", (0.0, 0.0, 1.5), 0.2, 0.6, self.cylinder),
             shapes.mesh("wedge", (tetrahedron, faces), center=(-1.0, 0.0, 0.0)),
         ]
-        self.monitor = Clearance(bodies, obstacles, safe=0.05, influence=10.0, by_fcl=by_fcl)
+        self.monitor = Clearance(bodies, obstacles, safe=0.05, influence=10.0)
+        if not by_fcl:
+            # As if none of FCL's answers were proven.
+            self.monitor.scene.fcl = self.monitor.scene.of_hulls = None
 
     def poses(self):
         return [(turn(self.rng), self.rng.normal(size=3) * 0.8) for _ in self.hulls]
@@ -256,7 +259,8 @@ def test_distances_from_cylinders_agree_to_the_last_digits():
     points = np.arange(4 * len(hulls)).reshape(-1, 4).tolist()
     bodies = convex_bodies(points, hulls, 0.0, names, joints=np.zeros((len(hulls), 2), dtype=int))
     post = shapes.cylinder("post", (0.0, 0.0, 0.0), 0.1, 0.3)
-    monitor = Clearance(bodies, [post], safe=0.0, influence=10.0, self_collision=False, by_fcl=False)
+    monitor = Clearance(bodies, [post], safe=0.0, influence=10.0, self_collision=False)
+    monitor.scene.of_hulls = None
     poses = [(turn(rng), rng.normal(size=3) * 0.25) for _ in hulls]
     X = np.vstack([hull.simplex @ R.T + t for hull, (R, t) in zip(hulls, poses, strict=True)])
     contacts = monitor.near(X, 0.0, 10.0)

@@ -44,7 +44,7 @@ class Clearance:
     watch : bool
         Whether small scenes at rest are watched; the answers are the same.
     by_fcl : bool
-        Whether :meth:`near` may use python-fcl for the contacts.
+        Whether :meth:`near` may use python-fcl for the contacts of capsules.
     unit : float
         Unit of length of the tolerances of its answers, m.
     """

@@ -47,8 +47,8 @@ class Scene:
         Whether pairs of bodies that are not neighbours count.
     unit : float
         Unit of length of the tolerances of FCL's answers, m.
-    fcl : FclQueries or None
-        Supplies contacts; None if only closed forms are used.
+    fcl, of_hulls : FclQueries or None
+        Supplies contacts, and those of hulls, which have no closed form; None where these are not used.
     nothing, nothing_found : Contacts, (0, 2 E + 5)
         No rows, and no contacts.
     shapes : list of str
@@ -77,7 +77,10 @@ class Scene:
         self.pieces = ObstaclePieces(self.obstacles)
         names = tuple(obstacle.name for obstacle in self.obstacles)
         self.names = PairNames(self.bodies, names, tuple(self.pieces.obstacle.tolist()))
-        self.fcl = FclQueries(self.pieces, self.bodies, self.unit) if self._by_fcl else None
+        queries = (
+            FclQueries(self.pieces, self.bodies, self.unit) if self._by_fcl or self.bodies.hulls else None
+        )
+        self.fcl, self.of_hulls = queries if self._by_fcl else None, queries
         self.nothing_found = np.zeros((0, 2 * self.span + 5))
         self.nothing = self._contacts(np.zeros((0, 2 * self.span + 4), dtype=np.int64), self.nothing_found)
         self.shapes = sorted({*self.pieces.shape.tolist()} | ({"segment"} if self.has_self else set()))

@@ -161,7 +161,7 @@ class HullGroup(Group):
 
     def _witnesses(self, pairs: Array, sides: _Sides) -> tuple[Array, Array, Array, Mask]:
         """Return nearest points (k, 3) of body and other, m, normals (k, 3), and which of them FCL supplied (k,)."""
-        rows, fcl, unit = pairs[:, -1].astype(np.int64), self.scene.fcl, self.scene.unit
+        rows, fcl, unit = pairs[:, -1].astype(np.int64), self.scene.of_hulls, self.scene.unit
         proven = np.zeros(len(pairs), dtype=bool)
         x, y, normal = np.zeros((3, len(pairs), 3))
         if fcl is not None:
