@@ -208,14 +208,11 @@ def test_a_tube_does_not_close_at_a_singular_pose(offset: float) -> None:
     assert "home" in far.undecided[0].reason
 
 
-@pytest.mark.parametrize("offset", [0.0, 0.06])
 @pytest.mark.parametrize("module", MODULES)
-def test_what_sampling_finds_is_above_what_is_proven(
-    module: str, offset: float, rng: np.random.Generator
-) -> None:
+def test_what_sampling_finds_is_above_what_is_proven(module: str, rng: np.random.Generator) -> None:
     answers = set()
     for size in (0.1, 0.2, 0.3):
-        problem = two_bays(module, offset)
+        problem = two_bays(module)
         arm = recorded(problem)
         rows = actuator_rows(rng, arm, 4, 0.02)
         solver = TrussSolver(arm)
@@ -389,7 +386,7 @@ def beside_its_path(rng: np.random.Generator, module: str) -> tuple[vq.Problem, 
 def test_what_offset_joints_pass_between_rows_is_found_and_what_is_clear_is_certified(
     module: str, rng: np.random.Generator
 ) -> None:
-    found = [scene for _ in range(12) if (scene := beside_its_path(rng, module))]
+    found = [scene for _ in range(6) if (scene := beside_its_path(rng, module))]
     assert found
     for scene, rows, least in found:
         nearer = vq.certify(scene.replace({"clearance.safe": least + 1e-4}), np.arange(len(rows)), rows)

@@ -53,6 +53,8 @@ class TrussSolver:
         self._column = np.full(len(arm.home), len(arm.free))
         self._column[arm.free] = np.arange(len(arm.free))
         self.size = float(np.abs(arm.home).max()) + float(arm.length.max())
+        self.tolerance = 64.0 * float(np.finfo(float).eps) * self.size
+        """Of lengths that nodes are solved for, m."""
         # Triangles (J, 3) of offset joints; both joints of each member (M, 2), (M, 0) for pin joints.
         self._triangles, self.joints = np.zeros((0, 3), dtype=np.int64), np.zeros_like(arm.members[:, :0])
         if not arm.has_pin_joints:
@@ -73,14 +75,13 @@ class TrussSolver:
     def solve(self, nodes: Array, lengths: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Return nodes (U, N, 3) of lengths (U, M), m, by Newton steps from `nodes`, and which of them were found."""
         nodes, free = nodes.copy(), self.arm.free
-        tolerance = 64.0 * float(np.finfo(float).eps) * self.size
         open_ = np.arange(len(nodes))
         before = np.full(len(nodes), np.inf)
         for _ in range(_NEWTON_STEPS):
             missing = lengths[open_] - self.arm.lengths(nodes[open_])
             worst = np.abs(missing).max(axis=1)
             # Once the residual no longer halves, the last digits are as good as they get.
-            going = np.isfinite(worst) & ((worst > tolerance) | (worst < 0.5 * before[open_]))
+            going = np.isfinite(worst) & ((worst > self.tolerance) | (worst < 0.5 * before[open_]))
             before[open_] = worst
             open_, missing = open_[going], missing[going]
             if not len(open_):
@@ -90,7 +91,7 @@ class TrussSolver:
             except np.linalg.LinAlgError:
                 break
             nodes[open_[:, None], free] += step.reshape(len(open_), -1, 3)
-        return nodes, before <= tolerance
+        return nodes, before <= self.tolerance
 
     def apart(self, nodes: Array, moved: Array) -> Array:
         """Return (U, M + J, ...) how far members' nodes move apart, m, and how far joints are deformed.
@@ -164,15 +165,15 @@ class Within:
         self.bends = _BEND * solver.reach * self.turn**2
 
     def errors(self, rates: list[Array]) -> Array:
-        """Return (U, M, ...) how far lengths' rates are from those of the first derivatives, m, see `slots`."""
+        """Return (U, M, ...) how far the lengths' rates differ from those at the start, m, for rates as of `slots`."""
         wider = (..., *(None,) * (rates[0].ndim - 2))
-        found = self.slopes[0][wider] * rates[0]
+        found: Array = self.slopes[0][wider] * rates[0]
         for slope, rate in zip(self.slopes[1:], rates[1:], strict=True):
             found += slope[wider] * rate
         return found
 
     def ends(self, nodes: Array, deformed: Array) -> Array:
-        """Return (U, M) the speeds of members' ends, m, if nodes have (U, N), and `deformed` as in `apart`."""
+        """Return (U, M) how far members' ends move, m, where nodes move by (U, N), and joints as in `deformed`."""
         _, *joints = self._solver.slots(deformed)
         found = nodes[:, self._solver.arm.members].max(axis=2)
         for k, rate in enumerate(joints):
@@ -216,7 +217,9 @@ def tube(solver: TrussSolver, nodes: Array, start: Array, change: Array) -> Tube
     of_slots = solver.slots(of_all)
     velocity = np.einsum("unck,uk->unc", every, change)
     first = solver.apart(nodes, velocity)
-    first = first * _INFLATED + 1e-9 * (first.max(axis=1, keepdims=True) + 1e-9 * solver.size)
+    # Where the truss stands still, nodes are solved for to the last digits only.
+    first = first * _INFLATED + 2.0 * solver.tolerance * of_all.sum(axis=2)
+    first += 1e-9 * first.max(axis=1, keepdims=True)
     most = np.full(first.shape, _MOST_DEFORMED)
     most[:, : start.shape[1]] = start
     eye = np.eye(len(arm.members))
@@ -443,5 +446,5 @@ class _FollowedTruss:
 
     def _with_rounding(self, motion: TrussMotion) -> TrussMotion:
         """Return the motion, its `rounding` increased by the effect of the lengths' rounding on positions."""
-        motion.rounding += 2.0 * self.error * 64.0 * float(np.finfo(float).eps) * self.solver.size
+        motion.rounding += 2.0 * self.error * self.solver.tolerance
         return motion
