@@ -134,7 +134,7 @@ class TrussSolver:
         return found.reshape(len(nodes), len(self.arm.free), 3, -1)
 
 
-class Within:
+class TubeBounds:
     """How far lengths (U, M), m, and ends may change while a truss keeps to bounds `apart` (U, M + J).
 
     See `TrussSolver.apart`. A deformation by r leaves at least (1 - r - r^2/4) / (1 + r) of a joint's heights.
@@ -226,12 +226,12 @@ def tube(solver: TrussSolver, nodes: Array, start: Array, change: Array) -> Tube
     wider = (1.0 + _SLACK) * first + _SLACK**2 * first.max(axis=1, keepdims=True)
     apart = wider
     for _ in range(_ROUNDS):
-        within = Within(solver, apart, start)
+        within = TubeBounds(solver, apart, start)
         errors = _solved(eye - within.errors(of_slots), within.errors(solver.slots(wider)))
         apart = wider + _times(of_all, errors)
         # Bounds that have become useless stay so.
         apart = np.where((apart >= wider) & (apart < most), apart, 0.999 * most)
-    within = Within(solver, apart, start)
+    within = TubeBounds(solver, apart, start)
     errors = within.errors(solver.slots(apart))
     again = first + _times(of_all, errors) * _INFLATED
     closed = ~singular & (again < apart).all(axis=1) & (apart < most).all(axis=1)
