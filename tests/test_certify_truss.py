@@ -106,7 +106,8 @@ def test_the_second_derivatives_of_offset_ends_and_lengths_are_within_their_boun
     corners = nodes + h * np.array([one + other, one - other, other - one, -one - other])
     mixed = np.einsum("k,k...->...", [1.0, -1.0, -1.0, 1.0], arm.ends(corners)) / (4.0 * h * h)
     joint = solver.joints
-    bound = 3.6 * solver.reach * (deformed[joint, 0] * deformed[joint, 1])
+    small = TubeBounds(solver, np.full((1, len(arm.members) + len(deformed)), 1e-3), arm.length[None])
+    bound = small.bends[0] / 1e-3**2 * deformed[joint, 0] * deformed[joint, 1]
     assert (np.linalg.norm(mixed, axis=2) <= bound * 1.01 + 1e-6 * steepest**2).all()
     # What `TubeBounds` says of a neighbourhood holds for the gradient at any place in it, along any way.
     moved = one * 0.05 / steepest
