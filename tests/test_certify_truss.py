@@ -3,17 +3,26 @@
 from __future__ import annotations
 
 import importlib
+from itertools import islice, pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from arms import arm_problem
+from arms import arm_problem, central_differences
+from hypothesis import assume, given
+from hypothesis import strategies as st
 from numpy.typing import NDArray
+from oracle import norm
+from scipy.sparse.linalg import spsolve
 
 import vgtm_qp as vq
 from vgtm_qp.arm.build import make_arm
+from vgtm_qp.arm.truss.arm import TrussArm
+from vgtm_qp.arm.truss.determinacy import length_jacobian
+from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.certify.certify import Certifier
-from vgtm_qp.certify.truss_motion import TrussSolver, truss_motion, tube
+from vgtm_qp.certify.truss_motion import TrussSolver, TubeBounds, truss_motion, tube
 from vgtm_qp.verify.arm import RecordedArm
 
 Array = NDArray[np.float64]
@@ -25,10 +34,9 @@ def recorded(problem: vq.Problem) -> RecordedArm:
     return RecordedArm(arm.record(), arm.bodies.joints)
 
 
-def two_bays(module: str = "octahedral", **more: Any) -> vq.Problem:
-    return arm_problem(
-        truss={"module": module, "actuated": [1, 2, 3] if module == "tetrahedral" else None}, **more
-    )
+def two_bays(module: str = "octahedral", offset: float = 0.0, **more: Any) -> vq.Problem:
+    truss = {"module": module, "actuated": [1, 2, 3] if module == "tetrahedral" else None}
+    return arm_problem(truss=truss | {"joint_offset": offset}, **more)
 
 
 def actuator_rows(rng: np.random.Generator, arm: RecordedArm, rows: int, step: float) -> Array:
@@ -48,12 +56,13 @@ def followed(solver: TrussSolver, start: Array, lengths: Array, steps: int) -> A
     return np.array(found)
 
 
+@pytest.mark.parametrize("offset", [0.0, 0.06])
 @pytest.mark.parametrize("module", MODULES)
-def test_a_tube_holds_the_motion_and_its_bends(module: str, rng: np.random.Generator) -> None:
-    arm = recorded(two_bays(module))
+def test_a_tube_holds_the_motion_and_its_bends(module: str, offset: float, rng: np.random.Generator) -> None:
+    arm = recorded(two_bays(module, offset))
     solver = TrussSolver(arm)
     closed = 0
-    for step in (0.002, 0.01, 0.04):
+    for step in (0.0005, 0.002, 0.01, 0.04):
         start, end = actuator_rows(rng, arm, 3, step)[1:]
         first, solved = solver.solve(arm.home[None], start[None])
         assert solved[0]
@@ -62,12 +71,12 @@ def test_a_tube_holds_the_motion_and_its_bends(module: str, rng: np.random.Gener
             continue
         closed += 1
         ways = followed(solver, first[0], end, 100)
-        moved = ways - ways[0]
-        apart = np.linalg.norm(moved[:, arm.members[:, 1]] - moved[:, arm.members[:, 0]], axis=2)
-        assert (apart.max(axis=0) <= found.apart[0] + 1e-12).all()
-        speed = np.linalg.norm(np.diff(ways, axis=0), axis=2).max(axis=0) * 100
+        start_again = np.broadcast_to(ways[0], ways.shape)
+        assert (solver.apart(start_again, ways - ways[0]).max(axis=0) <= found.apart[0] + 1e-12).all()
+        ends = arm.ends(ways)
+        speed = np.linalg.norm(np.diff(ends, axis=0), axis=3).max(axis=(0, 2)) * 100
         assert (speed <= found.speed[0] * (1.0 + 1e-6) + 1e-9).all()
-        bend = np.linalg.norm(np.diff(ways, n=2, axis=0), axis=2).max(axis=0) * 100**2
+        bend = np.linalg.norm(np.diff(ends, n=2, axis=0), axis=3).max(axis=(0, 2)) * 100**2
         assert (bend <= found.bend[0] * (1.0 + 1e-6) + 1e-8).all()
         # An error of lengths may move nodes more at the end than at the start.
         last = np.linalg.norm(solver.inverse(ways[-1:])[0], axis=1).sum(axis=1).max()
@@ -77,7 +86,55 @@ def test_a_tube_holds_the_motion_and_its_bends(module: str, rng: np.random.Gener
     assert closed
 
 
-def tripod() -> vq.Problem:
+@given(
+    edges=st.lists(st.floats(-1.0, 1.0), min_size=6, max_size=6),
+    ways=st.lists(st.floats(-1.0, 1.0), min_size=12, max_size=12),
+)
+def test_the_second_derivatives_of_offset_ends_and_lengths_are_within_their_bounds(
+    edges: list[float], ways: list[float]
+) -> None:
+    arm = recorded(tripod(0.05))
+    solver = TrussSolver(arm)
+    # Two of the feet move here; the frames of all four joints turn with them.
+    nodes = arm.home + np.vstack([np.reshape(edges, (2, 3)), np.zeros((2, 3))])
+    one, other = (np.vstack([np.reshape(way, (2, 3)), np.zeros((2, 3))]) for way in (ways[:6], ways[6:]))
+    with np.errstate(all="ignore"):
+        deformed = solver.apart(nodes[None], np.stack([one, other], axis=-1)[None])[0, len(arm.members) :]
+    steepest = float(deformed.max())
+    assume(np.isfinite(steepest) and 1e-2 < steepest < 1e2)
+    h = 1e-3 / steepest
+    corners = nodes + h * np.array([one + other, one - other, other - one, -one - other])
+    mixed = np.einsum("k,k...->...", [1.0, -1.0, -1.0, 1.0], arm.ends(corners)) / (4.0 * h * h)
+    joint = solver.joints
+    small = TubeBounds(solver, np.full((1, len(arm.members) + len(deformed)), 1e-3), arm.length[None])
+    bound = small.bends[0] / 1e-3**2 * deformed[joint, 0] * deformed[joint, 1]
+    assert (np.linalg.norm(mixed, axis=2) <= bound * 1.01 + 1e-6 * steepest**2).all()
+    # What `TubeBounds` says of a neighbourhood holds for the gradient at any place in it, along any way.
+    moved = one * 0.05 / steepest
+    kept = solver.apart(nodes[None], moved[None])
+    gradient, index = arm.length_gradient(np.stack([nodes, nodes + moved]))
+    changed = np.abs(((gradient[1] - gradient[0]) * other[index]).sum(axis=(1, 2)))
+    rates = solver.slots(solver.apart(nodes[None], other[None]))
+    assert (
+        changed <= TubeBounds(solver, kept, arm.lengths(nodes)[None]).errors(rates)[0] + 1e-9 * steepest
+    ).all()
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.06])
+@pytest.mark.parametrize("module", MODULES)
+def test_gradients_of_lengths_are_those_of_finite_differences(
+    module: str, offset: float, rng: np.random.Generator
+) -> None:
+    arm = recorded(two_bays(module, offset))
+    nodes = arm.home + 0.05 * rng.normal(size=arm.home.shape)
+    gradient, index = arm.length_gradient(nodes)
+    dense = np.zeros((len(arm.members), *arm.home.shape))
+    for slot in range(index.shape[1]):
+        dense[np.arange(len(index)), index[:, slot]] += gradient[:, slot]
+    np.testing.assert_allclose(dense, central_differences(arm.lengths, nodes), atol=1e-8)
+
+
+def tripod(offset: float = 0.0) -> vq.Problem:
     # Three members in a plane hold a node that can leave it.
     nodes = [
         {"name": name, "position": position, "fixed": name != "top"}
@@ -90,7 +147,7 @@ def tripod() -> vq.Problem:
     truss = {"module": "graph", "node": nodes, "member": members, "tip": ["top"], "member_radius": 0.01}
     return vq.Problem.from_dict(
         {
-            "truss": truss,
+            "truss": truss | {"joint_offset": offset},
             "maneuver": {"waypoint": [{"time": 1.0, "position": [0.0, 0.0, 0.1]}]},
             "method": {"tracking": "none"},
             "clearance": {"safe": 0.01, "influence": 0.1, "self_collision": False},
@@ -134,8 +191,9 @@ def test_nodes_of_the_same_lengths_elsewhere_are_not_taken_for_the_motion(
     ] * len(middle)
 
 
-def test_a_tube_does_not_close_at_a_singular_pose() -> None:
-    problem = tripod()
+@pytest.mark.parametrize("offset", [0.0, 0.05])
+def test_a_tube_does_not_close_at_a_singular_pose(offset: float) -> None:
+    problem = tripod(offset)
     arm = recorded(problem)
     shorter = arm.length - 0.001
     (finding,) = vq.certify(problem, [0.0, 1.0], [arm.length, shorter]).undecided
@@ -280,15 +338,73 @@ def test_what_is_locked_keeps_its_length() -> None:
     assert (finding.kind, finding.names) == ("lock", (name,))
 
 
-def test_offset_joints_leave_it_undecided_but_limits_are_still_checked() -> None:
-    problem = two_bays().replace({"truss.joint_offset": 0.05})
-    arm = recorded(problem)
-    home = arm.length[arm.actuated]
-    verdict = vq.certify(problem, [0.0, 1.0], [home, home + 0.001])
-    assert verdict.answer == "undecided"
-    assert verdict.clearance == -np.inf
-    assert "offset joints" in verdict.undecided[0].reason
-    assert vq.certify(problem, [0.0, 1.0], [home, home + 5.0]).answer == "violated"
+def sampled(truss: Truss, rows: Array, steps: int) -> Array:
+    """(T, M, 2, 3) members' ends at many instants between rows of lengths, by the code that moves the arm."""
+    nodes, found = truss.home.copy(), [truss.member_ends(truss.home)]
+    for before, after in pairwise(rows):
+        for share in np.linspace(0.0, 1.0, steps + 1)[1:]:
+            for _ in range(3):
+                missing = (
+                    before + share * (after - before) - norm(np.diff(truss.member_ends(nodes), axis=1)[:, 0])
+                )
+                nodes[truss.free] += spsolve(length_jacobian(truss, nodes), missing).reshape(-1, 3)
+            found.append(truss.member_ends(nodes))
+    return np.array(found)
+
+
+def beside_its_path(rng: np.random.Generator, module: str) -> tuple[vq.Problem, Array, float] | None:
+    """A ball beside a point of a truss with offset joints that is nearer between two rows than at any row.
+
+    The problem, the rows of its actuators' lengths, and the least clearance that sampling finds.
+    """
+    problem = two_bays(module, float(rng.choice([0.02, 0.06])))
+    arm = make_arm(problem)
+    assert isinstance(arm, TrussArm)
+    truss = arm.truss
+    steps, rows = 40, actuator_rows(rng, recorded(problem), int(rng.integers(2, 5)), 0.03)
+    ends = sampled(truss, rows, steps)
+    k = steps * int(rng.integers(len(rows) - 1)) + int(rng.integers(10, 30))
+    member, at = int(rng.integers(len(truss.members))), rng.uniform()
+    path = ends[:, member, 0] + at * (ends[:, member, 1] - ends[:, member, 0])
+    away = np.cross(ends[k, member, 1] - ends[k, member, 0], path[k + 1] - path[k - 1])
+    if norm(away) < 1e-4:
+        return None
+    radius, distance = 0.005, truss.radius[member] + 0.03
+    center = path[k] + away / norm(away) * (radius + distance)
+    axis = ends[:, :, 1] - ends[:, :, 0]
+    along = np.clip(((center - ends[:, :, 0]) * axis).sum(-1) / (axis * axis).sum(-1), 0.0, 1.0)
+    apart = norm(center - ends[:, :, 0] - along[..., None] * axis) - truss.radius - radius
+    if apart[::steps].min() < apart.min() + 5e-4 or apart.min() < 2e-3:
+        return None
+    ball = {"name": "ball", "shape": "sphere", "center": center.tolist(), "radius": radius}
+    scene = problem.replace(
+        {"obstacle": [ball], "clearance.self_collision": False, "truss.stroke": [0.1, 9.0]}
+    )
+    return scene, rows[:, truss.actuated], float(apart.min())
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_what_offset_joints_pass_between_rows_is_found_and_what_is_clear_is_certified(
+    module: str, rng: np.random.Generator
+) -> None:
+    drawn = (beside_its_path(rng, module) for _ in range(40))
+    found = list(islice(filter(None, drawn), 2))
+    assert len(found) == 2
+    for scene, rows, least in found:
+        nearer = vq.certify(scene.replace({"clearance.safe": least + 1e-4}), np.arange(len(rows)), rows)
+        assert {finding.kind for finding in nearer.violations} == {"clearance"}
+        assert nearer.clearance <= least + 1e-9
+        clear = vq.certify(scene.replace({"clearance.safe": least - 1e-3}), np.arange(len(rows)), rows)
+        assert clear.certified, str(clear)
+
+
+def test_a_maneuver_with_offset_joints_is_certified_from_its_table(tmp_path: Path) -> None:
+    problem = vq.load_problem("offset_joints_past_a_cube").replace({"maneuver.steps": 10})
+    maneuver = vq.solve(problem)
+    table = vq.export_maneuver(maneuver, tmp_path / "lengths.csv")
+    verdict = Certifier(problem.replace({"clearance.safe": 0.079})).certify_file(table)
+    assert verdict.certified, str(verdict)
+    assert verdict.clearance <= maneuver.clearance.min() + 1e-9
 
 
 def test_a_motion_that_cannot_be_followed_to_its_end_is_certified_to_where_it_can(monkeypatch: Any) -> None:

@@ -1,9 +1,17 @@
 """The motion of a truss whose actuators change their lengths linearly, followed from home on with a proof.
 
-The nodes x solve l(x) = L(s). From a known state, with the inverse A of the length Jacobian there, they move with
-x' = A (L' - e), where e holds for each member the change of its direction times the relative velocity w of its ends.
-If bounds of |w| reproduce themselves, the motion exists and keeps to them, and no other nodes within them have its
-lengths. Each length's l'' = 0 then bounds x'', and so how far nodes leave their chords.
+The nodes x solve l(x) = L(s). From a known state, with the inverse A of the length Jacobian J there, they move with
+x' = A (L' - e), where e = (J(x) - J) x'. It is bounded by how far, and how fast, each member's nodes move apart and
+each offset joint's triangle is deformed. If these bounds reproduce themselves, the motion exists and keeps to them, and
+no other nodes within them have its lengths. Each length's l'' = 0 then bounds x'', and so how far ends leave their
+chords.
+
+A joint's frame depends on the edges e1 and e2 of its triangle, of heights h1 and h2 above each other. Edges that change
+by f1 and f2 turn it by at most r = |f1|/h1 + |f2|/h2, its deformation: across its plane by the vector
+((f2.z) e1 - (f1.z) e2) / |e1 x e2|, within it by half of each edge's own turn. That turn's derivative along another
+deformation q is at most 2.6 r q, since z and the factors of f1 and f2 change at most by q times their sizes 1, 1/h1
+and 1/h2, the factor (z x e1)/|e1|^2 by 2 q/h1. An end at a distance d from its node has a second derivative of at
+most 3.6 d r q.
 """
 
 from __future__ import annotations
@@ -32,6 +40,9 @@ _NEWTON_STEPS = 30
 _CHUNK = 4_000_000
 _INFLATED = 1.0 + 1e-6
 """Factor of bounds that covers the rounding of solutions of linear equations."""
+_BEND = 3.6
+_MOST_DEFORMED = 0.5
+"""Factor of an end's second derivative, see above, and the deformation of a joint up to which it is bounded."""
 
 
 class TrussSolver:
@@ -42,6 +53,15 @@ class TrussSolver:
         self._column = np.full(len(arm.home), len(arm.free))
         self._column[arm.free] = np.arange(len(arm.free))
         self.size = float(np.abs(arm.home).max()) + float(arm.length.max())
+        self.tolerance = 64.0 * float(np.finfo(float).eps) * self.size
+        """Of lengths that nodes are solved for, m."""
+        # Triangles (J, 3) of offset joints; both joints of each member (M, 2), (M, 0) for pin joints.
+        self._triangles, self.joints = np.zeros((0, 3), dtype=np.int64), np.zeros_like(arm.members[:, :0])
+        if not arm.has_pin_joints:
+            self._triangles, joints = np.unique(arm.corners.reshape(-1, 3), axis=0, return_inverse=True)
+            self.joints = joints.reshape(-1, 2)
+        self.reach = np.linalg.norm(arm.offset, axis=2)[:, : self.joints.shape[1]]
+        """(M, 2) distances of members' ends from their nodes, m; (M, 0) for pin joints."""
 
     def jacobian(self, nodes: Array) -> Array:
         """Return (U, M, 3 F) the derivatives of the lengths by the free nodes at nodes (U, N, 3), m/m."""
@@ -55,14 +75,13 @@ class TrussSolver:
     def solve(self, nodes: Array, lengths: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Return nodes (U, N, 3) of lengths (U, M), m, by Newton steps from `nodes`, and which of them were found."""
         nodes, free = nodes.copy(), self.arm.free
-        tolerance = 64.0 * float(np.finfo(float).eps) * self.size
         open_ = np.arange(len(nodes))
         before = np.full(len(nodes), np.inf)
         for _ in range(_NEWTON_STEPS):
             missing = lengths[open_] - self.arm.lengths(nodes[open_])
             worst = np.abs(missing).max(axis=1)
             # Once the residual no longer halves, the last digits are as good as they get.
-            going = np.isfinite(worst) & ((worst > tolerance) | (worst < 0.5 * before[open_]))
+            going = np.isfinite(worst) & ((worst > self.tolerance) | (worst < 0.5 * before[open_]))
             before[open_] = worst
             open_, missing = open_[going], missing[going]
             if not len(open_):
@@ -72,12 +91,37 @@ class TrussSolver:
             except np.linalg.LinAlgError:
                 break
             nodes[open_[:, None], free] += step.reshape(len(open_), -1, 3)
-        return nodes, before <= tolerance
+        return nodes, before <= self.tolerance
 
-    def apart(self, moved: Array) -> Array:
-        """Return (U, M) how far the vectors between members' ends change where nodes are moved by (U, N, 3), m."""
+    def apart(self, nodes: Array, moved: Array) -> Array:
+        """Return (U, M + J, ...) how far members' nodes move apart, m, and how far joints are deformed.
+
+        Nodes (U, N, 3) are moved by (U, N, 3, ...), m. See above for the deformation, which has no unit.
+        """
         first, last = self.arm.members.T
-        return np.asarray(np.linalg.norm(moved[:, last] - moved[:, first], axis=2))
+        between = np.linalg.norm(moved[:, last] - moved[:, first], axis=2)
+        if not len(self._triangles):
+            return np.asarray(between)
+        own, others = self._triangles[:, :1], self._triangles[:, 1:]
+        edges = np.linalg.norm(moved[:, others] - moved[:, own], axis=3)
+        heights = self._heights(nodes).reshape(*edges.shape[:3], *(1,) * (edges.ndim - 3))
+        return np.concatenate([between, (edges / heights).sum(axis=2)], axis=1)
+
+    def _heights(self, nodes: Array) -> Array:
+        """Return (U, J, 2) the distance of both edges' far ends from the other edge's line, m."""
+        edges = nodes[:, self._triangles[:, 1:]] - nodes[:, self._triangles[:, :1]]
+        area = np.linalg.norm(np.cross(edges[:, :, 0], edges[:, :, 1]), axis=2)
+        return np.asarray(area[..., None] / np.linalg.norm(edges[:, :, ::-1], axis=3))
+
+    def slots(self, bounds: Array) -> list[Array]:
+        """Return the rows (U, M, ...) of `bounds` (U, M + J, ...) of a member's nodes, and of its offset joints."""
+        count = len(self.arm.members)
+        return [bounds[:, :count], *(bounds[:, count + joint] for joint in self.joints.T)]
+
+    def end_errors(self, nodes: Array) -> float:
+        """Return how far an end may move at most if each node at (U, N, 3) moves by 1 m, m."""
+        deformed = 2.0 * (1.0 / self._heights(nodes)).sum(axis=2)
+        return 1.0 + float((self.reach * deformed[:, self.joints]).max(initial=0.0))
 
     def inverse(self, nodes: Array) -> Array:
         """Return (U, F, 3, M) the derivatives of the free nodes by the lengths; NaN where they are singular."""
@@ -90,6 +134,53 @@ class TrussSolver:
         return found.reshape(len(nodes), len(self.arm.free), 3, -1)
 
 
+class TubeBounds:
+    """How far lengths (U, M), m, and ends may change while a truss keeps to bounds `apart` (U, M + J).
+
+    See `TrussSolver.apart`. A deformation by r leaves at least (1 - r - r^2/4) / (1 + r) of a joint's heights.
+
+    Attributes
+    ----------
+    between : (U, M)
+        How far the vectors between members' ends change, m.
+    turn, lever : (U, M, E)
+        How far a member's joints turn, rad, and how far its ends move per deformation, m. E is 2, or 0 for pin joints.
+    slopes : list of (U, M)
+        How far the derivatives of a length change: that by the vector between its nodes, m/m, and with offset joints
+        those by the deformations of its first and its second joint, m.
+    bends : (U, M, E)
+        Second derivatives of the ends in their joints by a share, if `apart` bounds speeds as well, m.
+    """
+
+    def __init__(self, solver: TrussSolver, apart: Array, length: Array) -> None:
+        self._solver = solver
+        apart, *deformed = solver.slots(apart)
+        r = np.stack(deformed, axis=2) if deformed else np.zeros((*apart.shape, 0))
+        grown = (1.0 + r) / (1.0 - r - 0.25 * r * r)
+        self.lever, self.turn = solver.reach * grown, grown * r
+        self.between = apart + (self.lever * r).sum(axis=2)
+        turned = _turned(self.between, length)
+        of_joints = self.lever * (turned[:, :, None] + _BEND * self.turn)
+        self.slopes = [turned, *np.moveaxis(of_joints, 2, 0)]
+        self.bends = _BEND * solver.reach * self.turn**2
+
+    def errors(self, rates: list[Array]) -> Array:
+        """Return (U, M, ...) how far the lengths' rates differ from those at the start, m, for rates as of `slots`."""
+        wider = (..., *(None,) * (rates[0].ndim - 2))
+        found: Array = self.slopes[0][wider] * rates[0]
+        for slope, rate in zip(self.slopes[1:], rates[1:], strict=True):
+            found += slope[wider] * rate
+        return found
+
+    def ends(self, nodes: Array, deformed: Array) -> Array:
+        """Return (U, M) how far members' ends move, m, where nodes move by (U, N), and joints as in `deformed`."""
+        _, *joints = self._solver.slots(deformed)
+        found = nodes[:, self._solver.arm.members].max(axis=2)
+        for k, rate in enumerate(joints):
+            found = np.maximum(found, nodes[:, self._solver.arm.members[:, k]] + self.lever[:, :, k] * rate)
+        return np.asarray(found)
+
+
 @dataclass
 class Tube:
     """Proven bounds of motions (U,) that start from known states, while a share goes from 0 to 1.
@@ -98,12 +189,12 @@ class Tube:
     ----------
     closed : (U,) bool
         Whether the bounds hold.
-    apart : (U, M)
-        Bounds of the change of the vector between a member's ends, m.
-    speed, bend : (U, N)
-        Bounds of |x'| and |x''| of the nodes, m.
+    apart : (U, M + J)
+        Bounds of the change of the vector between a member's nodes, m, and of joints' deformations.
+    speed, bend : (U, M)
+        Bounds of |r'| and |r''| of members' ends, m.
     sensitivity : (U,)
-        Bound of a node's displacement per error in each length, anywhere within the bounds, m/m.
+        Bound of an end's displacement per error in each length, anywhere within the bounds, m/m.
     """
 
     closed: NDArray[np.bool_]
@@ -122,35 +213,48 @@ def tube(solver: TrussSolver, nodes: Array, start: Array, change: Array) -> Tube
     singular = np.array([not np.isfinite(each).all() for each in inverse], dtype=np.bool_)
     every = np.zeros((count, len(arm.home), 3, len(arm.members)))
     every[:, arm.free] = np.where(singular[:, None, None, None], 0.0, inverse)
-    relative = every[:, arm.members[:, 1]] - every[:, arm.members[:, 0]]
-    of_nodes, of_members = np.linalg.norm(every, axis=2), np.linalg.norm(relative, axis=2)
+    of_nodes, of_all = np.linalg.norm(every, axis=2), solver.apart(nodes, every)
+    of_slots = solver.slots(of_all)
     velocity = np.einsum("unck,uk->unc", every, change)
-    first = solver.apart(velocity)
-    first = first * _INFLATED + 1e-9 * (first.max(axis=1, keepdims=True) + 1e-9 * solver.size)
+    first = solver.apart(nodes, velocity)
+    # Where the truss stands still, nodes are solved for to the last digits only.
+    first = first * _INFLATED + 2.0 * solver.tolerance * of_all.sum(axis=2)
+    first += 1e-9 * first.max(axis=1, keepdims=True)
+    most = np.full(first.shape, _MOST_DEFORMED)
+    most[:, : start.shape[1]] = start
     eye = np.eye(len(arm.members))
     wider = (1.0 + _SLACK) * first + _SLACK**2 * first.max(axis=1, keepdims=True)
     apart = wider
     for _ in range(_ROUNDS):
-        system = eye - of_members * _turned(apart, start)[:, None, :]
-        apart = _solved(system, wider)
+        within = TubeBounds(solver, apart, start)
+        errors = _solved(eye - within.errors(of_slots), within.errors(solver.slots(wider)))
+        apart = wider + _times(of_all, errors)
         # Bounds that have become useless stay so.
-        apart = np.where((apart >= wider) & (apart < start), apart, 0.999 * start)
-    turned = _turned(apart, start)
-    again = first + np.einsum("umk,uk->um", of_members, turned * apart) * _INFLATED
-    closed = ~singular & (again < apart).all(axis=1) & (apart < start).all(axis=1)
+        apart = np.where((apart >= wider) & (apart < most), apart, 0.999 * most)
+    within = TubeBounds(solver, apart, start)
+    errors = within.errors(solver.slots(apart))
+    again = first + _times(of_all, errors) * _INFLATED
+    closed = ~singular & (again < apart).all(axis=1) & (apart < most).all(axis=1)
     least = np.minimum(start, start + change)
-    curved = np.maximum(apart * apart - change * change, 0.0) / np.maximum(least, 1e-300)
-    system = eye - of_members * turned[:, None, :]
-    bends = _solved(system, np.einsum("umk,uk->um", of_members, curved))
+    closed &= ((within.between < start) & (least > 0.0)).all(axis=1)
+    curved = np.maximum(within.between**2 - change * change, 0.0) / np.maximum(least, 1e-300)
+    system = eye - within.errors(of_slots)
+    curved = _solved(system, curved + within.bends.sum(axis=2))
     # Rounding turns zeros into small numbers of either sign.
-    largest = 1e-9 * np.abs(bends).max(axis=1, keepdims=True)
-    closed &= np.isfinite(bends).all(axis=1) & (bends >= -largest).all(axis=1) & (least > 0.0).all(axis=1)
-    bends = np.where(closed[:, None], np.maximum(bends, 0.0) * _INFLATED + largest, 0.0)
-    speed = np.linalg.norm(velocity, axis=2) + np.einsum("unm,um->un", of_nodes, turned * apart)
-    bend = np.einsum("unm,um->un", of_nodes, curved + turned * bends) * _INFLATED
-    wrong = 1.0 + turned * _solved(system, of_members.sum(axis=2))
-    sensitivity = np.einsum("unm,um->un", of_nodes, wrong).max(axis=1)
-    return Tube(closed, apart, speed * _INFLATED, bend, sensitivity)
+    largest = 1e-9 * np.abs(curved).max(axis=1, keepdims=True)
+    closed &= np.isfinite(curved).all(axis=1) & (curved >= -largest).all(axis=1)
+    curved = np.where(closed[:, None], np.maximum(curved, 0.0) * _INFLATED + largest, 0.0)
+    speed = within.ends(np.linalg.norm(velocity, axis=2) + _times(of_nodes, errors), apart)
+    bend = within.ends(_times(of_nodes, curved), _times(of_all, curved))
+    bend += within.bends.max(axis=2, initial=0.0)
+    wrong = _solved(system, np.ones(start.shape))
+    sensitivity = within.ends(_times(of_nodes, wrong), _times(of_all, wrong)).max(axis=1)
+    return Tube(closed, apart, speed * _INFLATED, bend * _INFLATED, sensitivity)
+
+
+def _times(factors: Array, of: Array) -> Array:
+    """Return (U, K) the products of matrices (U, K, M) and vectors (U, M)."""
+    return np.asarray((factors @ of[:, :, None])[:, :, 0])
 
 
 def _turned(apart: Array, length: Array) -> Array:
@@ -187,8 +291,7 @@ class TrussMotion(GivenMotion):
         self._solver, self._nodes, self._apart, self._problem = solver, nodes, apart, problem
         self._lengths = solver.arm.lengths(nodes)
         super().__init__(solver.arm, time, self._placed(nodes, time))
-        first, last = solver.arm.members.T
-        self.bends = np.maximum(bends[:, first], bends[:, last])
+        self.bends = bends
         self.lost: set[int] = set()
 
     def ends_at(self, segment: Index, share: Array) -> Array:
@@ -198,7 +301,7 @@ class TrussMotion(GivenMotion):
         chord = before + share[..., None] * (after - before)
         lengths = self._lengths[segment] + share * (self._lengths[segment + 1] - self._lengths[segment])
         nodes, solved = self._solver.solve(chord, lengths)
-        beyond = self._solver.apart(nodes - before) - self._apart[segment]
+        beyond = self._solver.apart(before, nodes - before) - self._apart[segment]
         self.lost |= set(segment[~solved | (beyond > 1e-9 * self._solver.size).any(axis=1)].tolist())
         return self.arm.states_ends(self._placed(nodes, self.times_at(segment, share[:, 0])))
 
@@ -224,8 +327,6 @@ def truss_motion(
     if that is before the first row. A finding says from when on it is unknown.
     """
     start, end = float(time[0]), float(time[-1])
-    if not arm.has_pin_joints:
-        return None, [_doubt(start, end, "where offset joints are between rows is not bounded")]
     solver, lengths = TrussSolver(arm), np.concatenate([arm.length[None], lengths])
     followed = _FollowedTruss(solver, _rows(solver, lengths), lengths, time)
     known = followed.follow()
@@ -301,7 +402,9 @@ class _FollowedTruss:
         """Return the intervals (P,) in which a tube proves that `first` leads to `last`, and store these."""
         begin, end = (self._lengths_at(segment, start + step) for step in (0.0, width))
         found = tube(self.solver, first, begin, end - begin)
-        closed = np.asarray(found.closed & (self.solver.apart(last - first) <= found.apart).all(axis=1))
+        closed = np.asarray(
+            found.closed & (self.solver.apart(first, last - first) <= found.apart).all(axis=1)
+        )
         self.parts.append(
             (
                 segment[closed],
@@ -313,7 +416,8 @@ class _FollowedTruss:
                 found.apart[closed],
             )
         )
-        self.error = max(self.error, float(found.sensitivity[closed].max(initial=0.0)))
+        error = float(found.sensitivity[closed].max(initial=0.0)) * self.solver.end_errors(first[closed])
+        self.error = max(self.error, error)
         return closed
 
     def motion(self, known: int, problem: Mapping[str, Any]) -> TrussMotion:
@@ -327,7 +431,7 @@ class _FollowedTruss:
         order = order[(segment[order] >= 1) & (segment[order] < known)]
         if not len(order):
             row, time = self.rows[1], np.repeat(self.time[:1], 2)
-            still = np.zeros((1, len(arm.home))), np.zeros((1, len(arm.members)))
+            still = np.zeros((1, len(arm.members))), np.zeros((1, apart.shape[1]))
             return self._with_rounding(TrussMotion(self.solver, time, np.stack([row, row]), *still, problem))
         segment, start = segment[order], start[order]
         nodes = np.concatenate([first[order], last[order[-1:]]])
@@ -335,12 +439,12 @@ class _FollowedTruss:
         time = np.append(before + start * (after - before), self.time[known - 1])
         poses = base_poses(problem, time)
         turn = np.linalg.norm(np.diff(poses[:, 3:], axis=0), axis=1)[:, None]
-        reach = np.linalg.norm(nodes, axis=2)
+        reach = np.linalg.norm(arm.ends(nodes), axis=3).max(axis=2)
         reach = np.maximum(reach[:-1], reach[1:]) + bend[order] / 8.0
         bends = bend[order] + turn * (2.0 * speed[order] + turn * reach)
         return self._with_rounding(TrussMotion(self.solver, time, nodes, bends, apart[order], problem))
 
     def _with_rounding(self, motion: TrussMotion) -> TrussMotion:
         """Return the motion, its `rounding` increased by the effect of the lengths' rounding on positions."""
-        motion.rounding += 2.0 * self.error * 64.0 * float(np.finfo(float).eps) * self.solver.size
+        motion.rounding += 2.0 * self.error * self.solver.tolerance
         return motion

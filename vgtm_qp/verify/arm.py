@@ -215,21 +215,27 @@ class RecordedArm:
     def length_gradient(self, nodes: Array) -> tuple[Array, Index]:
         """Return (..., M, Q, 3) the gradients of the lengths with respect to (M, Q) nodes, m/m, at nodes (..., N, 3).
 
-        For offset joints they are central differences over the joints' own corners, exact to about 1e-9.
+        An offset joint turns by w where the edges a and b of its triangle, of normal z, change by da and db:
+        w = ((db.z) a - (da.z) b) / |a x b| + z (z.(a x da) / a.a + z.(b x db) / b.b) / 2.
         """
         place = nodes[..., self.corners, :]
+        ends = self._ends_at(place, self.offset)
+        direction = _unit(ends[..., 1, :] - ends[..., 0, :])
+        outward = np.stack([-direction, direction], axis=-2)
         if self.has_pin_joints:
-            direction = _unit(place[..., 1, 0, :] - place[..., 0, 0, :])
-            return np.stack([-direction, direction], axis=-2), self.members
-        step = 1e-6 * float(self.length.max())
-        gradient = np.empty((*place.shape[:-3], 2, 3, 3))
-        for e, c, axis in np.ndindex(2, 3, 3):
-            change = np.zeros((2, 3, 3))
-            change[e, c, axis] = step
-            ahead, behind = (self._ends_at(place + sign * change, self.offset) for sign in (1.0, -1.0))
-            longer, shorter = (_norm(ends[..., 1, :] - ends[..., 0, :]) for ends in (ahead, behind))
-            gradient[..., e, c, axis] = (longer - shorter) / (2.0 * step)
-        return gradient.reshape(*gradient.shape[:-3], 6, 3), self.corners.reshape(-1, 6)
+            return outward, self.members
+        first, second = (place[..., k, :] - place[..., 0, :] for k in (1, 2))
+        normal = np.cross(first, second)
+        area = np.linalg.norm(normal, axis=-1, keepdims=True)
+        z, moment = normal / area, np.cross(ends - place[..., 0, :], outward)
+        spin = 0.5 * (moment * z).sum(axis=-1, keepdims=True)
+        gradient = np.empty(place.shape)
+        for k, edge, across in ((1, first, -second), (2, second, first)):
+            tilt = (moment * across).sum(axis=-1, keepdims=True) / area
+            along = (edge * edge).sum(axis=-1, keepdims=True)
+            gradient[..., k, :] = tilt * z + spin * np.cross(z, edge) / along
+        gradient[..., 0, :] = outward - gradient[..., 1, :] - gradient[..., 2, :]
+        return gradient.reshape(*gradient.shape[:-4], -1, 6, 3), self.corners.reshape(-1, 6)
 
     def singular_values(
         self, nodes: Array, *, most_dense: int = _DENSE_UNKNOWNS
