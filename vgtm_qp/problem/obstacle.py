@@ -191,8 +191,8 @@ class ClearanceTable(Table, called="[clearance]"):
     )
     distance: Literal["fcl", "exact"] = Field(
         default="fcl",
-        description="what gives the rows of pairs that can become active: FCL, each answer proven, or closed forms; hulls "
-        "have none, and are FCL's in both",
+        description="what gives the rows of pairs that can become active: FCL, each answer proven, or closed forms; "
+        "hulls have none, and are FCL's in both",
     )
     self_collision: Flag = Field(
         default=True, description="whether members that share no node keep apart too"
