@@ -261,7 +261,7 @@ def test_a_step_limit_is_named_with_an_amount_that_suffices():
     problem = three_bays(
         **{
             "end_effector.mode": "hard",
-            "method.step_limit": 0.004,
+            "method.step_limit": 0.013,
             "maneuver.steps": 4,
             "maneuver.waypoint": [{"time": 8.0, "position": [0.3, 0.0, 2.5]}],
         }
@@ -273,7 +273,7 @@ def test_a_step_limit_is_named_with_an_amount_that_suffices():
     assert (change["kind"], change["unit"]) == ("step limit", "m")
     assert f"method.step_limit: {1000.0 * change['amount']:.3g} mm more" in blocked.stopped_by
     assert (
-        vq.solve(problem.replace({"method.step_limit": 0.004 + change["amount"]})).reached > blocked.reached
+        vq.solve(problem.replace({"method.step_limit": 0.013 + change["amount"]})).reached > blocked.reached
     )
 
 
