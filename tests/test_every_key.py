@@ -351,7 +351,7 @@ ARM_CASES: dict[str, tuple[Changes, Changes]] = {
     "arm.base_link": (FILE, {"arm.base_link": "l1", "arm.home": [0.1] * 5}),
     "arm.tip_link": (FILE, {"arm.tip_link": "l5", "arm.home": [0.1] * 5}),
     "arm.home": (FILE, {"arm.home": [0.12] * 6}),
-    "arm.bodies": (FILE, {"arm.bodies": "hull"}),
+    "arm.bodies": (FILE, {"arm.bodies": "capsule"}),
     "arm.tip_rotation_vector": ({}, {"arm.tip_rotation_vector": [0.1, 0.0, 0.0]}),
     "arm.body.name": (body(), body(name="sail")),
     "arm.body.joint": (body(), body(joint="j4")),

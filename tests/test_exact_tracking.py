@@ -42,7 +42,7 @@ def gaps(resolver):
     ("module", "bays", "track"),
     [
         ("octahedral", 5, "position"),
-        ("octahedral", 6, "pointing"),
+        ("octahedral", 7, "pointing"),
         ("hexapod", 4, "pointing"),
         ("longeron", 6, "orientation"),
         ("tetrahedral", 4, "position"),

@@ -162,8 +162,8 @@ def test_osqp_is_set_up_a_few_times_in_a_maneuver_with_many_blocked_qps(monkeypa
     monkeypatch.setenv("VGTM_CC", "none")
     problem = vq.load_problem("snake_past_a_cube").replace({"method.solver": "osqp"})
     assert vq.solve(problem).status == "solved"
-    assert counts["solve"] > 100
-    assert counts["setup"] < 0.05 * counts["solve"]
+    assert counts["solve"] > 50, counts
+    assert counts["setup"] < 0.1 * counts["solve"]
 
 
 @pytest.mark.filterwarnings("error")

@@ -77,10 +77,10 @@ def test_a_maneuver_takes_more_steps_instead():
 
 @pytest.mark.parametrize("mode", ["hard", "elastic"])
 def test_a_tip_that_stays_on_time_is_refused_by_name(mode):
-    maneuver = vq.solve(limited("five_bay_two_cubes", 0.02, **{"end_effector.mode": mode}))
+    maneuver = vq.solve(limited("five_bay_two_cubes", 0.002, **{"end_effector.mode": mode}))
     assert maneuver.status == "blocked"
     assert maneuver.manifest["stop"]["kind"] == StopKind.STEP_LIMIT
-    assert "method.step_limit, 0.02 m" in maneuver.manifest["stop"]["reason"]
+    assert "method.step_limit, 0.002 m" in maneuver.manifest["stop"]["reason"]
 
 
 def test_a_base_that_moves_further_is_refused_by_name():
