@@ -46,7 +46,9 @@ def test_both_paths_take_the_same_steps_from_every_state_of_a_maneuver(name, cha
     kept = ("safe", "self_safe", "influence", "self_collision")
     options = {key: getattr(monitor, key) for key in kept}
     by_fcl = monitor.scene.fcl is not None
-    listed = Clearance(monitor.bodies, monitor.obstacles, watch=False, by_fcl=by_fcl, **options)
+    listed = Clearance(
+        monitor.bodies, monitor.obstacles, watch=False, by_fcl=by_fcl, unit=monitor.scene.unit, **options
+    )
     fast, plain = vq.Resolver(problem), vq.Resolver(replace(slow, monitor=listed))
     assert isinstance(fast.setup.engine, FusedEngine)
     # Until it is compiled both are the same.
@@ -71,4 +73,5 @@ def test_both_paths_take_the_same_steps_from_every_state_of_a_maneuver(name, cha
             furthest = max(furthest, float(apart) if steps[0].progress > 0.05 else 1e-5 * float(apart))
         value += steps[0].progress * (mark - value)
     assert compared >= 20
-    assert furthest < 1e-10
+    # The last digits of FCL's normals at hulls depend on what it was asked before.
+    assert furthest < (1e-7 if monitor.bodies.hulls else 1e-10)
