@@ -46,7 +46,8 @@ def assert_all_minima(curve, closest, distance_to):
     assert closest.distance[0] <= values.min() + 1e-12
     for s in sampled_minima(values):
         assert np.abs(closest.s - s).min() < 2.0 / len(DENSE)
-    for side in (-1e-4, 1e-4):
+    # Polygons may have minima that are narrower than a thousandth.
+    for side in (-1e-6, 1e-6):
         around = distance_to(curve.position(np.clip(closest.s + side, 0.0, 1.0)))
         assert np.all(around >= closest.distance - 1e-12)
 
