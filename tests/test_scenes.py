@@ -191,3 +191,9 @@ def test_ipopt_finds_no_worse_step_than_the_qp_and_nearly_the_same_short_one(num
             found.append(step.state.q)
         assert cost(found[1]) <= cost(found[0]) * (1.0 + 1e-5)
     assert np.abs(found[1] - found[0]).max() < 0.1 * np.abs(found[0] - home).max()
+
+
+def test_an_arm_that_brakes_in_a_shorter_step_does_not_pass_a_jam():
+    """The steps that bring it to rest have durations of their own."""
+    maneuver = solve(varied_scene(20261215, 260, arms="serial"))
+    assert maneuver.certificate.ok, maneuver.certificate.failures()

@@ -153,7 +153,7 @@ class QPResolver(Resolver, serves="qp"):
         """See :class:`Resolver`; pieces are halved until one is safe."""
         state, limits = self._state, self._actuation.limits(self._state, dt, slowing=True)
         brake, smallest, worst = None, _SMALLEST, ANY_RANK
-        if whole == 1.0 and (brake := self._known_braking()) is not None:
+        if (brake := self._braking_until_jam()) is not None:
             smallest, worst = _SMALLEST_MOVING, brake.rank
         target = self._shaping.target(state, dt, path, start, end, limits[:2])
         step, braking = self._advancer.first_accepted(state, target, dt, smallest, worst)
@@ -171,6 +171,13 @@ class QPResolver(Resolver, serves="qp"):
                 return None
             step = self._brake(braking, path, start, end, Step(StepStatus.BLOCKED, 0.0, self.state, "", 0))
             return self._told(step, path, start, end)
+
+    def _braking_until_jam(self) -> Braking | None:
+        """Return the known braking if its first step, which has a duration of its own, ends before the next jam."""
+        braking, now = self._known_braking(), self._state.time
+        if braking is None or self._actuation.until_jam(now, braking.steps[0][0].time - now) < 1.0:
+            return None
+        return braking
 
     def _known_braking(self) -> Braking | None:
         """Return the steps that bring the arm to rest; None if it is at rest."""
