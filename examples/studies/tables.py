@@ -4,7 +4,7 @@
     python examples/studies/tables.py figure8      only this one
     python examples/studies/tables.py tracking     a thousand scenes in six forms: another hour and more
     python examples/studies/tables.py robustness   a thousand scenes with and without a compiler: two hours
-    python examples/studies/tables.py serial       serial arms beside IPOPT: half an hour and more
+    python examples/studies/tables.py serial       serial arms beside IPOPT: an hour
     python examples/studies/tables.py loops        100,000 steps: half an hour
     python examples/studies/tables.py --short      every command in its quick form; the document stays as it is
 
@@ -43,7 +43,7 @@ OPTIONS = {
 """Of the studies that take any."""
 COMMANDS = {
     **{name: f"vgtm study {name} {OPTIONS.get(name, '')}".strip() for name in STUDIES},
-    "serial": "vgtm study robustness --arms serial --scenes 200 --seed 20261215 --without-compiler 999 "
+    "serial": "vgtm study robustness --arms serial --scenes 1000 --seed 20261215 --without-compiler 1000 "
     "--against ipopt",
     "changes": "vgtm study loops --scenes 100 --seed 20261203 --changes 0.4",
     "bench": "vgtm bench --seconds 0.7",
