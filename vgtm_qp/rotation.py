@@ -18,6 +18,13 @@ def rotation_from_vector(vector: ArrayLike) -> Array:
     return np.asarray(np.eye(3) + np.sin(angle) * axis + (1.0 - np.cos(angle)) * axis @ axis)
 
 
+def quaternion(rotation: Array) -> Array:
+    """Return the quaternions w, x, y, z (..., 4) of rotations (..., 3, 3), one or a row of them."""
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(np.roll(Rotation.from_matrix(rotation).as_quat(), 1, axis=-1))
+
+
 def vector_from_rotation(rotation: Array) -> Array:
     """Return the rotation vector (3,), rad, of a (3, 3) rotation; accurate up to half a turn inclusive."""
     twist = np.array(

@@ -13,6 +13,7 @@ from vgtm_qp.errors import ExportError
 from vgtm_qp.result.chain import RecordedChain
 from vgtm_qp.result.poses import base_poses, rotations
 from vgtm_qp.result.result import Result
+from vgtm_qp.rotation import quaternion
 from vgtm_qp.verify.arm import Arm, RecordedArm, arm_of
 from vgtm_qp.view.drawing import (
     FIXED_COLOUR,
@@ -166,7 +167,7 @@ def _add_joints(
     parent = _add(world, "body", name="base", mocap="true", pos=(0.0, 0.0, 0.0))
     bodies = [parent]
     for j, name in enumerate(arm.quantity_names):
-        parent = _add(parent, "body", name=name, pos=arm.position[j], quat=_quaternion(arm.rotation[j]))
+        parent = _add(parent, "body", name=name, pos=arm.position[j], quat=quaternion(arm.rotation[j]))
         kind = "hinge" if arm.revolute[j] else "slide"
         joint = _add(parent, "joint", name=name, type=kind, axis=arm.axis[j])
         if np.isfinite(arm.stroke[j]).all():
@@ -228,13 +229,6 @@ def _add_drives(root: Element, arm: RecordedChain) -> None:
             )
             if np.isfinite(arm.stroke[k]).all():
                 drive.set("ctrlrange", _text(arm.stroke[k]))
-
-
-def _quaternion(rotation: Array) -> Array:
-    """Return the quaternions w, x, y, z (..., 4) of rotations (..., 3, 3), one or a row of them."""
-    from scipy.spatial.transform import Rotation
-
-    return np.asarray(np.roll(Rotation.from_matrix(rotation).as_quat(), 1, axis=-1))
 
 
 def _add_obstacle(
@@ -300,7 +294,7 @@ class _GivenPoses(NamedTuple):
         time = maneuver.time
         if isinstance(arm, RecordedChain):
             poses = base_poses(maneuver.manifest["problem"], time)
-            base, turns = poses[:, None, :3], _quaternion(rotations(poses[:, 3:]))[:, None]
+            base, turns = poses[:, None, :3], quaternion(rotations(poses[:, 3:]))[:, None]
         else:
             base = maneuver.nodes[:, np.sort(arm.base)]
             turns = np.zeros((len(time), base.shape[1], 4))

@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from vgtm_qp.arrays import Array
 from vgtm_qp.errors import VgtmError
 from vgtm_qp.problem.urdf import UrdfVisual, read_visuals
 from vgtm_qp.result.chain import RecordedChain
+from vgtm_qp.rotation import quaternion
 
 _SAME = 1e-9
 """Difference of joints, m or 1, up to which the URDF file is still that of the arm."""
@@ -65,8 +65,7 @@ class LinkScene:
         frames = self._arm.along(q[None])[2]
         for k, frame in self._frames.items():
             origin, attitude = frames[k]
-            turn = np.roll(Rotation.from_matrix(attitude[0]).as_quat(), 1)
-            for key, value in (("position", origin[0]), ("wxyz", turn)):
+            for key, value in (("position", origin[0]), ("wxyz", quaternion(attitude[0]))):
                 rounded = np.round(value / resolution) * resolution if resolution else value
                 setattr(frame, key, rounded.astype(np.float32))
 

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from vgtm_qp.arrays import Array
 from vgtm_qp.errors import MissingExtraError
 from vgtm_qp.result.chain import RecordedChain
+from vgtm_qp.rotation import quaternion
 from vgtm_qp.view.drawing import (
     CURVE_COLOUR,
     FIXED_COLOUR,
@@ -44,7 +44,7 @@ class _DrawnObstacle:
     def place(self, time: float) -> None:
         """Put it where it is at `time`, s."""
         self.frame.position = self.mesh.position(time)
-        self.frame.wxyz = _wxyz(self.mesh.rotation(time))
+        self.frame.wxyz = quaternion(self.mesh.rotation(time))
 
 
 def import_viser() -> Any:
@@ -170,7 +170,7 @@ class ArmScene:
                     handle.batched_colors = colours[which]
             for hull, surface in self._hulls:
                 at, turn = hull.pose(nodes)
-                surface.position, surface.wxyz = numbers(at), numbers(_wxyz(turn))
+                surface.position, surface.wxyz = numbers(at), numbers(quaternion(turn))
                 if tuple(surface.color) != (colour := tuple(_rgb(shown[hull.body]).tolist())):
                     surface.color = colour
             self._nodes.batched_positions = numbers(nodes[self._drawing.marks])
@@ -260,7 +260,7 @@ class ArmScene:
             color=_rgb(FIXED_COLOUR),
             flat_shading=True,
             position=position,
-            wxyz=_wxyz(rotation),
+            wxyz=quaternion(rotation),
         )
 
     def _add_obstacle(self, mesh: ObstacleMesh) -> _DrawnObstacle:
@@ -312,11 +312,6 @@ def _placement(ends: Array) -> tuple[Array, Array, Array]:
     w = np.sqrt((1.0 + direction[:, 2]) / 2.0)
     wxyz = np.column_stack([w, -direction[:, 1] / (2.0 * w), direction[:, 0] / (2.0 * w), np.zeros(len(w))])
     return ends.mean(axis=1), wxyz, span
-
-
-def _wxyz(rotation: Array) -> Array:
-    """Return the quaternion w, x, y, z of a rotation (3, 3)."""
-    return np.roll(Rotation.from_matrix(rotation).as_quat(), 1)
 
 
 def _segments(points: Array) -> Array:
