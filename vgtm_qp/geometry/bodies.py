@@ -78,6 +78,11 @@ class Hull:
         size = float(np.linalg.norm(np.ptp(vertices, axis=0)))
         return cls(simplex, vertices, weights, faces, normals, size)
 
+    @cached_property
+    def inverse(self) -> Array:
+        """(3, 3) inverse of the edges of the simplex, columns, from its first corner: a rotation is edges @ inverse."""
+        return np.linalg.inv((self.simplex[1:] - self.simplex[0]).T)
+
 
 def _simplex(points: Array) -> Array:
     """Return the corners (4, 3) of a simplex that encloses points (K, 3), along their principal axes, m."""
@@ -128,12 +133,10 @@ class Bodies:
     def __len__(self) -> int:
         return len(self.points)
 
-    @property
+    @cached_property
     def is_hull(self) -> Mask:
         """(B,) bool, False for capsules."""
-        if not self.hulls:
-            return np.zeros(len(self), dtype=bool)
-        return np.array([hull is not None for hull in self.hulls], dtype=bool)
+        return np.asarray(self.counts > _CAPSULE)
 
     @cached_property
     def counts(self) -> Index:
@@ -157,7 +160,10 @@ class Bodies:
     @cached_property
     def sizes(self) -> Array:
         """(B,) sizes of the hulls, m; zero for capsules."""
-        return np.array([0.0 if hull is None else hull.size for hull in self.hulls])
+        sizes = np.zeros(len(self))
+        for body, hull in enumerate(self.hulls):
+            sizes[body] = 0.0 if hull is None else hull.size
+        return sizes
 
     def may_touch(self, first: Index, second: Index) -> Mask:
         """Return (P,) which pairs of bodies are neighbours or :attr:`touching`."""

@@ -66,7 +66,7 @@ class FclQueries:
         for k, hull in enumerate(bodies.hulls):
             if hull is not None:
                 self._corners[k] = hull.simplex.mean(axis=0)
-                self._inverse[k] = np.linalg.inv((hull.simplex[1:] - hull.simplex[0]).T)
+                self._inverse[k] = hull.inverse
         self._objects: dict[int, Any] = {}
         self._body, self._other = _Axis(), _Axis()
         self._request = fcl.DistanceRequest(enable_nearest_points=True, enable_signed_distance=False)

@@ -245,6 +245,7 @@ class Group:
         shifts = [state.take(points, axis=0) - reference for state in displacement.states]
         if self.scene.span > 2:
             return np.asarray(np.max([_apart(shift) for shift in shifts], axis=0))
+        # The same for two points a body, at a quarter of the cost.
         vectors = (_RELATIVE @ shift for shift in shifts)
         return np.asarray(
             np.max([np.sqrt(np.einsum("ksc,ksc->ks", v, v)).sum(axis=1) for v in vectors], axis=0)

@@ -222,11 +222,9 @@ class HullGroup(Group):
             found[chosen, contact, 0] = apart[kept]
             found[chosen, contact, 1 : 1 + span] = sides.weights[chosen, vertex]
             # The next one is far from the line through both.
-            along = np.zeros_like(x)
-            along[every] = aside[every, k] / np.maximum(away[every, k], _EXACT)[:, None]
-            away = np.linalg.norm(
-                aside - np.einsum("kvc,kc->kv", aside, along)[..., None] * along[:, None], axis=2
-            )
+            along = aside[every, k] / np.maximum(away[every, k], _EXACT)[:, None]
+            across = aside - np.einsum("kvc,kc->kv", aside, along)[..., None] * along[:, None]
+            away = np.linalg.norm(across, axis=2)
 
 
 class _Sides:
@@ -335,8 +333,7 @@ def _normals(bodies: Bodies, body: int, points: Array) -> Array:
     hull: Hull | None = bodies.hulls[body]
     if hull is None:
         return np.asarray(points[1:2] - points[:1])
-    corners = hull.simplex
-    turn = (points[1:] - points[0]).T @ np.linalg.inv((corners[1:] - corners[0]).T)
+    turn = (points[1:] - points[0]).T @ hull.inverse
     return np.asarray(hull.normals @ turn.T)
 
 

@@ -141,14 +141,13 @@ def read_urdf(
     ProblemError
         With one :class:`~vgtm_qp.errors.Mistake` for each fault, with its line.
     """
-    path = Path(file)
-    mistakes = Mistakes(path)
+    path, mistakes = Path(file), Mistakes(Path(file))
     tree = _Tree(read_xml(path), mistakes)
     base, tip = tree.ends(base_link, tip_link)
     chain = tree.chain(base, tip)
     places, notes = tree.places(chain, base)
     joints, tip_frame = tree.moving(chain, places)
-    shapes = Shapes(path.absolute(), [Path(place).absolute() for place in package_path], mistakes, bodies)
+    shapes = Shapes(path, package_path, mistakes, bodies)
     found, bare = tree.bodies(places, shapes)
     mistakes.stop()
     return UrdfArm(joints, *tip_frame, found, base, tip, (*notes, *bare), (path, *shapes.files))
@@ -165,18 +164,14 @@ def read_visuals(
 
     Shapes whose files are missing or damaged are left out. ProblemError where joints cannot be read.
     """
-    path = Path(file)
-    mistakes = Mistakes(path)
+    path, mistakes = Path(file), Mistakes(Path(file))
     tree = _Tree(read_xml(path), mistakes)
     base, tip = tree.ends(base_link, tip_link)
     chain = tree.chain(base, tip)
     places, _ = tree.places(chain, base)
     joints, _ = tree.moving(chain, places)
     mistakes.stop()
-    shapes = Shapes(
-        path.absolute(), [Path(place).absolute() for place in package_path], mistakes, "primitives"
-    )
-    return joints, tuple(tree.visuals(places, shapes))
+    return joints, tuple(tree.visuals(places, Shapes(path, package_path, mistakes, "primitives")))
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,8 +31,9 @@ class Shapes:
     `bodies` says what they become, as the key of ``[arm]`` does. `files` are the files that were read.
     """
 
-    def __init__(self, urdf: Path, packages: Sequence[Path], mistakes: Mistakes, bodies: str) -> None:
-        self._urdf, self._packages, self._mistakes, self._bodies = urdf, packages, mistakes, bodies
+    def __init__(self, urdf: Path, packages: Sequence[str | Path], mistakes: Mistakes, bodies: str) -> None:
+        self._urdf, self._packages = urdf.absolute(), [Path(place).absolute() for place in packages]
+        self._mistakes, self._bodies = mistakes, bodies
         self.files: list[Path] = []
         self._meshes: dict[Path, Array] = {}
 
