@@ -198,7 +198,8 @@ class Encounters(ABC):
 
     def _counting(self, low: Array, high: Array, start: int, stop: int, limit: float) -> Iterator[Pairs]:
         """Yield the pairs of `near` that count from state `start` on, some pairs at a time."""
-        first, second = self.near(low, high, start, stop, limit)
+        # Boxes round hulls that overlap are not apart, however deep that limit is below zero.
+        first, second = self.near(low, high, start, stop, max(limit, self.motion.resolution))
         if self.held_from:
             each = zip(first.tolist(), second.tolist(), strict=True)
             kept = np.array([self.held_from.get(pair, 0) <= start for pair in each], dtype=bool)
