@@ -298,6 +298,13 @@ def test_a_hull_inside_a_closed_mesh_is_not_clear_even_where_touching_is(tmp_pat
     certificate = vq.verify(maneuver, problem=vq.Problem.from_dict(data | {"obstacle": [shell]}))
     assert not certificate.clearance.ok
     assert certificate.clearance.value <= -0.1 * np.sqrt(3.0)
+    # A solid that the hull reaches into is seen too, however deep it is in it.
+    for size in (0.3, 2.0):
+        solid = {"name": "solid", "shape": "box", "size": size, "center": [0.1, 0.0, 0.8]}
+        certificate = vq.verify(maneuver, problem=vq.Problem.from_dict(data | {"obstacle": [solid]}))
+        for measure in (certificate.clearance, certificate.clearance_between):
+            assert not measure.ok
+            assert -2.0 * size < measure.value < 0.0
 
 
 def test_many_vertices_and_many_triangles_are_taken_by_parts(rng):
