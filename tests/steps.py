@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import piqp
+import pytest
 import qpsolvers
 import scipy.sparse
 from arms import random_pose
@@ -28,6 +29,12 @@ from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.target import QPInput, Target
 
 Array = NDArray[np.float64]
+
+
+def drives_nothing(patch: pytest.MonkeyPatch) -> None:
+    """Let every step of the resolvers made from now on be an attempt, none be taken in one call."""
+    patch.setattr("vgtm_qp.step.attempt.can_drive", lambda _: False)
+
 
 MOVED_BASE = Pose(np.array([0.01, 0.0, 0.02]), rotation_from_vector([0.01, -0.02, 0.015]))
 """A base that turned and moved a little."""

@@ -14,7 +14,7 @@ from vgtm_qp.arm.symbols import Bound, Constants
 from vgtm_qp.curve.families import make_family
 from vgtm_qp.native import building
 from vgtm_qp.qp.answer import Accuracy, CurvePoint
-from vgtm_qp.qp.fused import SOURCE, FusedSolver
+from vgtm_qp.qp.fused import FusedSolver
 from vgtm_qp.qp.linearise import Linearisation
 from vgtm_qp.qp.long.chain import find_chain
 from vgtm_qp.qp.long.staged import StagedSolver
@@ -49,7 +49,7 @@ def engines(name, *, joint_offset=0.0, track=None, vertices=5, **options):
 
 def fused_engine(layout, kinematics, task):
     """An engine whose C is there, if there is a compiler."""
-    assert building(SOURCE).finish() is not None
+    assert building().finish() is not None
     engine = FusedEngine(layout, kinematics, task, FusedSolver(layout))
     assert engine.is_ready
     return engine

@@ -338,13 +338,14 @@ def test_between_cylinders_the_states_are_those_of_closed_forms_to_what_fcl_leav
         data["clearance"]["distance"] = name
         maneuver = vq.solve(vq.Problem.from_dict(data))
         assert maneuver.certificate.ok
-        assert maneuver.manifest["clearance_rows"][name] > 20
+        assert maneuver.manifest["clearance_rows"][name] >= 5
         found.append(maneuver)
     assert found[0].manifest["clearance_rows"]["exact"] == 0
     np.testing.assert_allclose(found[0].nodes, found[1].nodes, atol=1e-4)
 
 
-def test_every_row_of_a_step_is_proven_and_lies_change_no_step(problem, monkeypatch):
+def test_every_row_that_presses_is_proven_and_lies_change_no_step(problem, monkeypatch):
+    pressed = 0
     goal = np.array([0.9, 0.0, 3.6])
     honest, lied, exact = (
         vq.Resolver(problem.replace({"clearance.distance": name})) for name in ("fcl", "fcl", "exact")
@@ -352,18 +353,22 @@ def test_every_row_of_a_step_is_proven_and_lies_change_no_step(problem, monkeypa
     lie = monkeypatch.context
     for _ in range(10):
         step = honest.step(position=goal)
-        assert step.fcl_rows == len(step.rows)
+        pressing = np.count_nonzero(step.solution.clearance_multipliers)
+        assert pressing <= step.fcl_rows <= len(step.rows)
         assert step.exact_rows == 0
+        pressed += pressing
         other = exact.step(position=goal)
         assert (other.fcl_rows, other.exact_rows) == (0, len(other.rows))
         with lie() as patched:
             lie_always(patched, too_far)
             third = lied.step(position=goal)
-        assert (third.fcl_rows, third.exact_rows) == (0, len(third.rows))
+        assert third.fcl_rows == 0
+        assert np.count_nonzero(third.solution.clearance_multipliers) <= third.exact_rows <= len(third.rows)
         np.testing.assert_array_equal(third.state.nodes, other.state.nodes)
         np.testing.assert_allclose(step.state.nodes, other.state.nodes, atol=1e-6)
         assert step.status == other.status == third.status
     assert honest.state.time > 0.0
+    assert pressed >= 10
 
 
 def test_a_wrong_distance_names_the_choices(problem):

@@ -13,6 +13,7 @@ import modules
 import numpy as np
 import pytest
 from arms import make_layout
+from steps import drives_nothing
 
 import vgtm_qp as vq
 from vgtm_qp.arm.truss.kinematics import LengthRows
@@ -21,7 +22,7 @@ from vgtm_qp.errors import EvaluationError, SolverError
 from vgtm_qp.methods import Resolver
 from vgtm_qp.native import building
 from vgtm_qp.qp.answer import Accuracy, CurvePoint
-from vgtm_qp.qp.fused import SOURCE, FusedSolver
+from vgtm_qp.qp.fused import FusedSolver
 from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.engine import Equalities
@@ -62,7 +63,7 @@ def test_a_function_without_a_value_at_its_first_call_raises():
 def test_a_tip_that_cannot_be_moved_is_not_settled(compiled, tmp_path, monkeypatch):
     monkeypatch.setenv("VGTM_CACHE", str(tmp_path))
     layout, _ = make_layout(modules.octahedral(2), vertices=0)
-    assert building(SOURCE).finish() is not None
+    assert building().finish() is not None
     solver = FusedSolver(layout, compiled=compiled)
     for kernel in solver.kernels:
         assert kernel.compile() == compiled
@@ -98,7 +99,7 @@ def test_a_tip_that_cannot_be_moved_is_not_settled(compiled, tmp_path, monkeypat
 
 
 def lie(monkeypatch, change):
-    """Let the settling of every fused solver give what `change` makes of the configuration."""
+    """Let the settling of every fused solver give what `change` makes of the configuration"""
     move = FusedSolver.move
 
     def wrong(self, *arguments):
@@ -125,6 +126,7 @@ LIES = {
 
 @pytest.mark.parametrize("what", LIES)
 def test_a_state_that_is_not_what_it_is_said_to_be_is_refused(monkeypatch, what):
+    drives_nothing(monkeypatch)
     resolver = Resolver(vq.load_problem("five_bay_free").replace({"method.tracking_mode": "elastic"}))
     before = resolver.state
     goal = resolver.tip()[0] + np.array([0.05, 0.0, -0.02])
@@ -137,6 +139,7 @@ def test_a_state_that_is_not_what_it_is_said_to_be_is_refused(monkeypatch, what)
 
 
 def test_a_state_of_an_earlier_call_is_refused(monkeypatch):
+    drives_nothing(monkeypatch)
     resolver = Resolver(vq.load_problem("five_bay_free").replace({"method.tracking_mode": "elastic"}))
     kept = []
 
@@ -152,6 +155,7 @@ def test_a_state_of_an_earlier_call_is_refused(monkeypatch):
 
 
 def test_an_attempt_whose_function_has_no_value_falls_back_or_is_refused(monkeypatch):
+    drives_nothing(monkeypatch)
     resolver = Resolver(vq.load_problem("five_bay_free").replace({"method.tracking_mode": "elastic"}))
     goal = resolver.tip()[0] + np.array([0.05, 0.0, -0.02])
 

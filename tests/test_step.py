@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from arms import TRUSSES, arm_problem, central_differences, make_layout, random_pose
 from scipy.spatial.transform import Rotation
+from steps import drives_nothing
 
 import vgtm_qp as vq
 from vgtm_qp.arm.arm import Pose
@@ -805,6 +806,7 @@ def test_what_holds_an_actuator_is_named_by_the_limit_that_does():
 
 
 def test_a_trial_curve_without_a_frame_blocks_its_piece_alone(crate_problem, monkeypatch):
+    drives_nothing(monkeypatch)
     resolver, target = vq.Resolver(crate_problem), vq.Resolver(crate_problem).tip()[0] + [0.02, 0.0, 0.0]
 
     def spoil(longest):

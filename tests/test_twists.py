@@ -17,7 +17,7 @@ from vgtm_qp.native import building
 from vgtm_qp.problem import Problem
 from vgtm_qp.problem.snake import snake
 from vgtm_qp.qp.answer import Accuracy
-from vgtm_qp.qp.fused import SOURCE, FusedSolver
+from vgtm_qp.qp.fused import FusedSolver
 from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.qp.solvers import make_solver
 from vgtm_qp.rotation import rotation_from_vector
@@ -85,7 +85,7 @@ def bent(setup, rng, size):
 def test_the_compiled_call_gives_the_answer_of_the_general_engine(name, tracked, base, rng):
     setup = setup_of(name, **TRACKED[tracked])
     layout, arm = setup.layout, setup.arm
-    assert building(SOURCE).finish() is not None
+    assert building().finish() is not None
     fused = FusedEngine(layout, setup.kinematics, setup.task, FusedSolver(layout, compiled=False))
     plain = GeneralEngine(layout, setup.kinematics, setup.task, make_solver("daqp", layout), compiled=False)
     assert fused.is_ready

@@ -14,9 +14,8 @@ from vgtm_qp.geometry.candidates import every_pair
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.geometry.pairs import Pair
 from vgtm_qp.geometry.shapes import GeometryError, box, cylinder, mesh, sphere
-from vgtm_qp.geometry.watch import SOURCE as WATCH
 from vgtm_qp.geometry.watch import Watch
-from vgtm_qp.native import Program, building
+from vgtm_qp.native import Code, Program, building
 
 MEMBERS = [(0, 1), (1, 2), (2, 3), (3, 4), (4, 5), (0, 2), (1, 4)]
 
@@ -253,10 +252,10 @@ def test_floors_below_zero_are_those_of_surfaces_that_overlap_already(floor):
 @pytest.mark.parametrize("broken", range(3))
 def test_a_pair_without_a_bound_is_never_proven_by_the_pairs_beside_it(broken):
     """Its distance is NaN in one state; in the next, nothing is known of its way."""
-    assert building(WATCH).finish() is not None
+    assert building().finish() is not None
     ends, known = ca.SX.sym("ends", 24), ca.SX.sym("known", 19)
     contact = Kernel(ca.Function("contact", [ends, known], [ca.repmat(known[0], 19)]), compiled=False)
-    pairs, way = Program(WATCH, "Pairs"), Program(WATCH, "Way")
+    pairs, way = Program("Pairs"), Program("Way")
     given = np.zeros((3, 19))
     given[:, 0] = 0.05
     given[broken, 0] = np.nan
@@ -269,10 +268,10 @@ def test_a_pair_without_a_bound_is_never_proven_by_the_pairs_beside_it(broken):
     way.set(
         ends=np.tile(np.array([0, 1], dtype=np.int32), 3), group=np.array([pairs.address], dtype=np.uintp)
     )
-    way.set(floors=np.zeros(1), limits=np.full(1, 0.1), middle=np.zeros((3, 3)), turned=np.zeros(3))
-    way.set(moved=np.zeros(3))
-    for code in (0, 3):
-        assert way.call("follow") == code
+    way.set(floor=0.0, limit=0.1, middle=np.zeros((3, 3)), turned=np.zeros(3), moved=np.zeros(3))
+    way.set(place=np.zeros((2, 3)))
+    for code in (Code.DONE, Code.NOT_PROVEN):
+        assert way.call("follow") is code
         assert pairs.data.near == 3
         assert pairs.data.overlaps
     assert not pairs.data.lowest >= 0.0

@@ -340,6 +340,14 @@ class Arm(ABC):
     def nodes(self, q: Array) -> Array:
         """Return (N, 3) the nodes at a configuration, m."""
 
+    def placing(self) -> Kernel | None:
+        """Return a function of its own, q -> nodes (3, N); None where the nodes are the configuration."""
+        return None
+
+    def straight_quantities(self) -> tuple[Index, Index] | None:
+        """Return (M,), (M,) the nodes whose distances the quantities are; None where they are something else."""
+        return None
+
     def points(self, q: Array) -> Array:
         """Return (P, 3) the points that span the bodies, m; by default the nodes."""
         return self.nodes(q)
@@ -369,6 +377,14 @@ class Arm(ABC):
     @abstractmethod
     def travel(self, motion: Array) -> float:
         """Return a bound of how far a node's coordinate moves in a displacement of the configuration, m."""
+
+    @property
+    def travel_levers(self) -> Array | None:
+        """Factors of the coordinates' displacements in the sum that is :meth:`travel` while the base is at rest.
+
+        None where it is the greatest of the displacements.
+        """
+        return None
 
     def furthest(self, q: Array, lower: Array, upper: Array) -> Array | None:  # noqa: ARG002
         """Return a displacement with the greatest move of each actuator in its box (n_a,); None if unknown.

@@ -159,6 +159,10 @@ class JointSpaceArm(Arm):
         kernel()
         return kernel.outputs[0].reshape(count, -1, 3).copy()
 
+    def placing(self) -> Kernel:
+        bound, compiling = self._placing
+        return bound.kernel(times=1, compiled=compiling)
+
     @cached_property
     def _known_nodes(self) -> dict[bytes, Array]:
         """The nodes of the last configurations."""
@@ -219,6 +223,10 @@ class JointSpaceArm(Arm):
         if base.any():
             joints += 2.0 * float(np.linalg.norm(base[3:])) * self.reaches[0] + np.abs(base[:3]).max()
         return float(joints)
+
+    @property
+    def travel_levers(self) -> Array:
+        return np.concatenate([self._levers, np.zeros(6)])
 
     @cached_property
     def _levers(self) -> Array:

@@ -87,6 +87,12 @@ class Clearance:
         return self.scene.pieces
 
     @property
+    def has_pairs(self) -> bool:
+        """Whether two bodies, or a body and an obstacle, can ever be near."""
+        count = len(self.bodies)
+        return bool(count and len(self.pieces)) or (self.self_collision and count > 1)
+
+    @property
     def names(self) -> PairNames:
         """Names of the pairs."""
         return self.scene.names
@@ -115,7 +121,7 @@ class Clearance:
         self.is_watched = self._may_watch and can_be_watched(self.scene)
         self._solids = Solids(self.scene)
 
-    def _watch(self) -> Watch | None:
+    def watching(self) -> Watch | None:
         """Return what watches the scene, if it can be watched and once that is compiled."""
         if self._watching is None and self.is_watched and is_ready(self.scene.shapes):
             self._watching = Watch(self.scene)
@@ -155,7 +161,7 @@ class Clearance:
         """
         reach = self.influence if reach is None else reach
         self_reach = min(reach, self.self_influence) if self_reach is None else self_reach
-        if tracked and (watch := self._watch()) is not None:
+        if tracked and (watch := self.watching()) is not None:
             watched = watch.near(X, reach, self_reach, by_fcl=by_fcl, wanted=wanted)
             if watched is not None:
                 return watched
@@ -277,7 +283,7 @@ class Clearance:
             A position is not finite; so do `near` and `least`.
         """
         self_floor = floor if self_floor is None else self_floor
-        if not lowered and (watch := self._watch()) is not None:
+        if not lowered and (watch := self.watching()) is not None:
             proven = watch.follow(places, floor, self_floor)
             if proven or not thorough:
                 return BetweenReport(proven, min(floor, self_floor), np.zeros(0), self.scene.nothing)

@@ -4,15 +4,13 @@ Each pair keeps a lower bound of its distance: its distance at the last evaluati
 approach of its bodies since. A body's distance from an obstacle changes by no more than an end of the body
 moves. The distance of two bodies changes by no more than the relative displacement of their middles plus the
 turns of both about these. If the bound falls below the limit, the pair is evaluated, and its distance on the
-motion from the state before is bounded: ``watch.c``.
+motion from the state before is bounded: ``pairs.c``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from enum import IntEnum
 from functools import cache
-from pathlib import Path
 
 import casadi as ca
 import numpy as np
@@ -26,24 +24,16 @@ from vgtm_qp.geometry.formulas import FURTHEST
 from vgtm_qp.geometry.groups import Found, Group, Scene
 from vgtm_qp.geometry.pairs import Contacts, Wanted
 from vgtm_qp.geometry.shapes import GeometryError
-from vgtm_qp.native import Program, building
-
-SOURCE = Path(__file__).with_name("watch.c")
+from vgtm_qp.native import Code, Program, building
 
 _MOST_PAIRS = 8000
 """Greatest number of pairs of a scene that can be watched."""
 
-_AHEAD = 1.2
+AHEAD = 1.2
 """Distance below which pairs are evaluated, over the last limit: the next limit may be larger."""
 
 _NEXT = 2.0
 """If no pair is near: distance below which pairs are still evaluated, in one call, over the limit."""
-
-
-class _FollowCode(IntEnum):
-    """What ``follow`` of ``watch.c`` returns."""
-
-    DONE, NO_VALUE, TOO_FAR, NOT_PROVEN = range(4)
 
 
 def can_be_watched(scene: Scene) -> bool:
@@ -63,20 +53,20 @@ def _contact(shape: str, _: str | None) -> tuple[ca.Function, Compiling]:
 
 def is_ready(shapes: Iterable[str]) -> bool:
     """Whether scenes of these shapes can be watched; always false if nothing can be compiled."""
-    source = building(SOURCE)
-    if not source.ask():
+    library = building()
+    if not library.ask():
         for shape in shapes:
             _contact(shape, compiler())[1].ask()
-    return source.library is not None
+    return library.library is not None
 
 
-class _WatchedGroup:
+class WatchedGroup:
     """The pairs of one shape, with bounds and contacts of the last evaluation."""
 
     def __init__(self, group: Group) -> None:
         function, compiling = _contact(group.shape, compiler())
         contact = Kernel(function, compiled=compiling)
-        self._program = Program(SOURCE, "Pairs")
+        self._program = Program("Pairs")
         self._program.set(
             is_self=int(group.is_self),
             next=_NEXT,
@@ -131,23 +121,28 @@ class _WatchedGroup:
 
 
 class Watch:
-    """Holds all pairs of a scene that :func:`can_be_watched`; one thread at a time."""
+    """Holds all pairs of a scene that :func:`can_be_watched`; one thread at a time.
+
+    Attributes
+    ----------
+    groups : list
+        The pairs of each shape.
+    """
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
-        self._groups: list[_WatchedGroup] = []
-        self._of_shape: dict[str, _WatchedGroup] = {}
+        self.groups: list[WatchedGroup] = []
+        self._of_shape: dict[str, WatchedGroup] = {}
         self._way: Program | None = None
         self._is_whole = True
         self._place: Array = np.zeros((0, 3))
-        self._at = b""
-        self._floors = self._limits = self._pairs = np.zeros(0)
-        self._reach = self._wanted = (-np.inf, -np.inf)
 
     def forget_pieces(self) -> None:
         """Forget the pairs with pieces, because the pieces are others now; pairs of bodies are kept."""
-        self._groups = [pairs for pairs in self._groups if pairs.group.is_self]
-        self._is_whole, self._at, self._reach = False, b"", (-np.inf, -np.inf)
+        self.groups = [pairs for pairs in self.groups if pairs.group.is_self]
+        self._is_whole = False
+        if self._way is not None:
+            self._way.set(reach=-np.inf, self_reach=-np.inf)
 
     def near(
         self,
@@ -163,10 +158,9 @@ class Watch:
         `X` (P, 3) are positions of the points; `by_fcl` says whether FCL supplies the contacts, `wanted`
         which pairs have any.
         """
-        if limit > self._reach[0] or self_limit > self._reach[1] or not self._is_at(X):
-            self._move_to(X, (limit, self_limit))
-        self._wanted = _AHEAD * limit, _AHEAD * self_limit
-        limits, near = (limit, self_limit), [pairs for pairs in self._groups if pairs.data.near]
+        way = self.move_to(X, limit, self_limit)
+        way.set(wanted=AHEAD * limit, self_wanted=AHEAD * self_limit)
+        limits, near = (limit, self_limit), [pairs for pairs in self.groups if pairs.data.near]
         if any(pairs.data.overlaps for pairs in near):
             return None
         return self._scene.contacts(
@@ -176,7 +170,7 @@ class Watch:
     def keeps(self, X: Array, floor: float, self_floor: float) -> bool:
         """Return whether `X` is the present state, and no surface distance there is below its floor, m."""
         floors = floor, self_floor
-        return self._is_at(X) and all(pairs.keeps(floors[pairs.group.is_self]) for pairs in self._groups)
+        return self._is_at(X) and all(pairs.keeps(floors[pairs.group.is_self]) for pairs in self.groups)
 
     def follow(self, places: Array, floor: float, self_floor: float) -> bool:
         """Return whether no surface distance falls below its floor, m, on a path of straight pieces.
@@ -184,54 +178,73 @@ class Watch:
         False may also mean that this was not proven. The path leads from one of the `places` of the points
         (K + 1, P, 3), m, to the next. The last place reached becomes the present state.
         """
-        reach = max(self._wanted[0], floor), max(self._wanted[1], self_floor)
         if not self._is_at(places[0]):
-            self._move_to(places[0], reach)
-        return self._go(places, (floor, self_floor), reach)
+            self._go(self._from_here(places[0]))
+        return self._go(places, floor, self_floor)
+
+    def move_to(self, X: Array, limit: float, self_limit: float) -> Program:
+        """Make `X` the present state, with all contacts nearer than the limits, m; return the ``Way`` of C."""
+        way = self._way
+        if way is None or limit > way.data.reach or self_limit > way.data.self_reach or not self._is_at(X):
+            places = self._from_here(X)
+            self.started(X).set(wanted=limit, self_wanted=self_limit)
+            self._go(places)
+        return self.started(X)
 
     def _is_at(self, X: Array) -> bool:
         """Return whether `X` (P, 3) are the positions of the present state."""
-        return X.tobytes() == self._at
+        way = self._way
+        return way is not None and way.data.reach > -np.inf and X.tobytes() == self._place.tobytes()
 
-    def _move_to(self, X: Array, reach: tuple[float, float]) -> None:
-        """Make `X` the present state, and evaluate the pairs that may be nearer than `reach`, m, there."""
-        before = X if self._way is None else self._place
-        self._go(np.stack([before, X]), (-np.inf, -np.inf), reach)
+    def _from_here(self, X: Array) -> Array:
+        """Return (2, P, 3) the present place, `X` if there is none, and `X`."""
+        return np.stack([X if self._way is None or self._way.data.lost else self._place, X])
 
-    def _go(self, places: Array, floors: tuple[float, float], reach: tuple[float, float]) -> bool:
+    def _go(self, places: Array, floor: float = -np.inf, self_floor: float = -np.inf) -> bool:
         """Go from place to place as long as the floors, m, are proven, and return whether all are.
 
         The last place reached becomes the present state. At the last of `places` the pairs that may be nearer
-        than `reach`, m, are evaluated.
+        than is wanted, m, are evaluated.
 
         Raises
         ------
         GeometryError
             A position is not finite; the present state stays as it was.
         """
-        way = self._start(places[0]) if self._way is None else self._way
-        if not self._is_whole:
-            self._hold([*map(self._watched, every_pair_with_pieces(self._scene, self._place)), *self._groups])
+        way = self.started(places[0])
         places = np.ascontiguousarray(places)
-        for k, pairs in enumerate(self._groups):
-            self._pairs[k] = pairs.address()
-            self._floors[k], self._limits[k] = floors[pairs.group.is_self], reach[pairs.group.is_self]
-        way.set(pieces=len(places) - 1, places=places)
-        code = _FollowCode(way.call("follow"))
-        if code is _FollowCode.TOO_FAR:
+        self.refresh()
+        way.set(
+            pieces=len(places) - 1,
+            places=places,
+            floor=floor,
+            self_floor=self_floor,
+            limit=max(way.data.wanted, floor),
+            self_limit=max(way.data.self_wanted, self_floor),
+        )
+        code = way.call("follow")
+        if code is Code.TOO_FAR:
             raise GeometryError("node positions must be finite numbers")
-        if code is _FollowCode.NO_VALUE:
-            self._way, self._at = None, b""
+        if code is Code.NO_VALUE:
             raise EvaluationError("the distance of a pair has no value")
-        done = way.data.done
-        self._place = places[done]
-        self._at = self._place.tobytes()
-        self._reach = reach if done == len(places) - 1 else floors
-        return code is _FollowCode.DONE
+        return code is Code.DONE
+
+    def refresh(self) -> None:
+        """Use the kernels that were compiled meanwhile."""
+        for k, pairs in enumerate(self.groups):
+            self._pairs[k] = pairs.address()
+
+    def started(self, X: Array) -> Program:
+        """Return the ``Way`` of C; list the pairs that are not listed: all at `X`, or those with pieces."""
+        if self._way is None or self._way.data.lost:
+            return self._start(X)
+        if not self._is_whole:
+            self._hold([*map(self._watched, every_pair_with_pieces(self._scene, self._place)), *self.groups])
+        return self._way
 
     def _start(self, X: Array) -> Program:
         """List all pairs, with their distances at `X`."""
-        bodies, self._way = self._scene.bodies, Program(SOURCE, "Way")
+        bodies, self._way, self._place = self._scene.bodies, Program("Way"), X.copy()
         self._way.set(
             points=len(X),
             bodies=len(bodies),
@@ -240,25 +253,24 @@ class Watch:
             middle=np.zeros((len(bodies), 3)),
             turned=np.zeros(len(bodies)),
             moved=np.zeros(len(bodies)),
+            place=self._place,
+            **dict.fromkeys(("reach", "self_reach", "wanted", "self_wanted"), -np.inf),
         )
-        self._place = X.copy()
         self._hold(list(map(self._watched, every_pair(self._scene, X))))
         return self._way
 
-    def _watched(self, group: Group) -> _WatchedGroup:
+    def _watched(self, group: Group) -> WatchedGroup:
         """Return what watches the pairs of `group`; kernels of a shape are set up once."""
         known = self._of_shape.get(group.shape)
         if known is None:
-            known = self._of_shape[group.shape] = _WatchedGroup(group)
+            known = self._of_shape[group.shape] = WatchedGroup(group)
         else:
             known.hold(group)
         return known
 
-    def _hold(self, groups: list[_WatchedGroup]) -> None:
+    def _hold(self, groups: list[WatchedGroup]) -> None:
         """Watch the pairs of `groups`, whose distances are those at the present place."""
         assert self._way is not None
-        count = len(groups)
-        self._groups, self._is_whole = groups, True
-        self._pairs = np.zeros(count, dtype=np.uintp)
-        self._floors, self._limits = np.zeros(count), np.zeros(count)
-        self._way.set(groups=count, group=self._pairs, floors=self._floors, limits=self._limits)
+        self.groups, self._is_whole = groups, True
+        self._pairs = np.zeros(len(groups), dtype=np.uintp)
+        self._way.set(groups=len(groups), group=self._pairs)

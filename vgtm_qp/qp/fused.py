@@ -1,12 +1,11 @@
 """The fast path of a step: one call of C linearises, condenses, solves, checks the answer and settles it.
 
-It answers the same QP as :mod:`vgtm_qp.qp.condensed`, in a tenth of the time for short arms; see ``fused.c``.
+It answers the same QP as :mod:`vgtm_qp.qp.condensed`, in a tenth of the time for short arms; see ``qp.c``.
 """
 
 from __future__ import annotations
 
 import ctypes
-from enum import IntEnum
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -17,10 +16,10 @@ from numpy.typing import NDArray
 
 from vgtm_qp.arm.joint_space import JointSpaceArm
 from vgtm_qp.arm.symbols import Constants
-from vgtm_qp.arrays import Array
+from vgtm_qp.arrays import Array, Index
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.errors import EvaluationError
-from vgtm_qp.native import Program, building
+from vgtm_qp.native import Code, Program, building
 from vgtm_qp.qp.answer import Accuracy, Closed, CurvePoint, Move, Settled, StepSolution
 from vgtm_qp.qp.daqp import DAQP
 from vgtm_qp.qp.dense import EQUALITY, DenseSolver
@@ -47,28 +46,19 @@ from vgtm_qp.qp.settle import (
 from vgtm_qp.qp.shape import CurveRows
 from vgtm_qp.rows.tip import TipGoal
 
-SOURCE = Path(__file__).with_name("fused.c")
 _NOWHERE: Array = np.zeros((0, 3))
 _LIBRARIES = (".so", ".dylib", ".dll")
 
 _ROOM, _SLOTS = 24, 4
 """Capacity at first: rows of clearance, and nodes of each."""
 
-
-class _FusedCode(IntEnum):
-    """Return codes of the functions of ``fused.c``."""
-
-    DONE = 0
-    NO_VALUE = 1
-    INFEASIBLE = 2
-    INACCURATE = 3
-    UNSETTLED = 4
-    FAILED = 5
+_SMALL_ERROR = 3e-6
+"""Error of a quantity, over the arm's unit, of which one step of Newton's method leaves next to nothing."""
 
 
 @cache
 def _daqp() -> dict[str, int]:
-    """Return the addresses of the functions of DAQP in CasADi's wheel, whose headers ``fused.c`` includes.
+    """Return the addresses of the functions of DAQP in CasADi's wheel, whose headers ``qp.c`` includes.
 
     There are none where the wheel has DAQP in no library of its own.
     """
@@ -96,11 +86,11 @@ class FusedSolver:
         solver: DenseSolver = DAQP,
         *,
         compiled: bool = True,
-        workspace: _FusedWorkspace | None = None,
+        workspace: FusedWorkspace | None = None,
     ) -> None:
         self.layout = layout
-        self._workspace = _FusedWorkspace(layout, solver, compiled) if workspace is None else workspace
-        self.solver = self._workspace.solver
+        self.workspace = FusedWorkspace(layout, solver, compiled) if workspace is None else workspace
+        self.solver = self.workspace.solver
         self._pull = np.zeros((layout.vertices, 3))
         weight = np.isin(np.arange(layout.vertices), layout.vertex_goals) * layout.weights.vertex_goal
         self._goals = {
@@ -111,30 +101,32 @@ class FusedSolver:
 
     def drawn(self, layout: Layout) -> FusedSolver:
         """Return the solver of a layout that differs only in its goals of control vertices."""
-        return FusedSolver(layout, workspace=self._workspace)
+        return FusedSolver(layout, workspace=self.workspace)
 
     @property
     def is_ready(self) -> bool:
         """Whether the C is compiled; always false if it cannot be."""
-        return self._workspace.is_ready
+        return self.workspace.is_ready
 
     @property
     def kernels(self) -> tuple[Kernel, ...]:
         """What the C calls: the functions of the rows, of what settling misses, and of the closing."""
-        return self._workspace.kernels
+        return self.workspace.kernels
 
     def load(self, asked: StepInput) -> None:
         """Set the state, the goal and the boxes of the next QP."""
-        self._workspace.use(self._goals)
-        asked.load(self._workspace.condense)
+        self.draw(asked.vertices, asked.vertex_goals if asked.motion else None)
+        asked.load(self.workspace.condense)
+
+    def draw(self, vertices: Array, goals: Array | None) -> None:
+        """Draw control vertices, which are at `vertices` (V, 3), to the layout's `goals` (V, 3), m, in the next QP."""
+        self.workspace.use(self._goals)
         if self.layout.vertex_goals:
-            self._pull[:] = 0.0
-            if asked.motion:
-                self._pull += self.layout.goal_pull(asked.vertices, asked.vertex_goals)
+            self._pull[:] = self.layout.goal_pull(vertices, goals)
 
     def aim(self, accuracy: Accuracy) -> None:
         """Settle to that `accuracy` from now on."""
-        self._workspace.aim(accuracy)
+        self.workspace.aim(accuracy)
 
     def solve(self, clearance: ClearanceRows) -> StepSolution:
         """Solve the QP at the state loaded last.
@@ -144,7 +136,7 @@ class FusedSolver:
         InfeasibleStepError, SolverError
             As ``CondensedSolver.solve``.
         """
-        near, work = self._workspace.take(clearance), self._workspace
+        near, work = self.workspace.take(clearance), self.workspace
         work.check(work.call("solve"))
         refuse_large(work.data.primal, work.data.dual, work.status)
         return self._whole(work.x, near)
@@ -160,11 +152,11 @@ class FusedSolver:
         InfeasibleStepError, SolverError
             As :meth:`solve`.
         """
-        near, work = self._workspace.take(clearance), self._workspace
+        near, work = self.workspace.take(clearance), self.workspace
         code, data = work.check(work.call("move", TOLERANCE)), work.data
-        if code == _FusedCode.INACCURATE:
+        if code == Code.INACCURATE:
             refuse_large(data.primal, data.dual, work.status)
-        solution, is_settled = self._solution(work.x, near, _NOWHERE, _NOWHERE), code == _FusedCode.DONE
+        solution, is_settled = self._solution(work.x, near, _NOWHERE, _NOWHERE), code == Code.DONE
         points = work.points if is_settled else work.started_points
         q, vertices = work.started.reshape(work.shape).copy(), points.reshape(-1, 3).copy()
         torsion = torsion + solution.torsion if len(torsion) else torsion
@@ -179,18 +171,18 @@ class FusedSolver:
 
         Actuators are in their boxes (n_a,). None if the iteration does not converge.
         """
-        work, inputs = self._workspace, self._workspace.condense.inputs
+        work, inputs = self.workspace, self.workspace.condense.inputs
         work.q[:], work.points[:] = q.reshape(-1), curve.vertices.reshape(-1)
         inputs[4][:], inputs[5][:] = lower, upper
         inputs[8][:], inputs[9][:] = goal.position, goal.rotation.T.reshape(-1)
         work.gone[0] = 0.0
-        if work.call("settle") != _FusedCode.DONE:
+        if work.call("settle") != Code.DONE:
             return None
         return Settled(work.closed(), CurvePoint(work.points.reshape(-1, 3).copy(), curve.torsion))
 
     def gain(self) -> Gain | None:
         """See ``CondensedSolver.gain_of``; for the QP solved last."""
-        work, count = self._workspace, self._workspace.actuators
+        work, count = self.workspace, self.workspace.actuators
         free = np.ones(work.size, dtype=bool)
         free[:count] = ~held(work.x[:count], work.lower[:count], work.upper[:count], self.layout.arm.fineness)
         free[-1] = False
@@ -199,7 +191,7 @@ class FusedSolver:
 
     def _whole(self, x: Array, near: int, *, moves: bool = True) -> StepSolution:
         """Return the solution of the unknowns `x`; without the motions by residuals unless it `moves`."""
-        work, layout, constant = self._workspace, self.layout, float(moves)
+        work, layout, constant = self.workspace, self.layout, float(moves)
         count, nodes = work.actuators, np.zeros((len(layout.arm.node_names), 3))
         nodes[layout.arm.free] = work.displacement(x, constant)
         vertices = constant * work.offset
@@ -208,8 +200,12 @@ class FusedSolver:
             vertices[2:] += x[count + 1 : work.torsion].reshape(-1, 3)
         return self._solution(x, near, nodes, vertices)
 
+    def answered(self) -> StepSolution:
+        """Return the answer of the QP solved last, without ``nodes`` and ``vertices``."""
+        return self._solution(self.workspace.x, int(self.workspace.data.near), _NOWHERE, _NOWHERE)
+
     def _solution(self, x: Array, near: int, nodes: Array, vertices: Array) -> StepSolution:
-        work, x = self._workspace, x.copy()
+        work, x = self.workspace, x.copy()
         count, first = work.actuators, work.size + work.first_near
         return StepSolution(
             nodes=nodes,
@@ -223,7 +219,7 @@ class FusedSolver:
         )
 
 
-class _FusedWorkspace:
+class FusedWorkspace:
     """The arrays of the C, and the kernels that it calls."""
 
     hessian: Array
@@ -234,7 +230,7 @@ class _FusedWorkspace:
 
     def __init__(self, layout: Layout, solver: DenseSolver, compiled: bool) -> None:
         arm, self.solver, equal = layout.arm, solver, len(layout.tip_rows) + len(layout.hard)
-        self._layout, self._source = layout, building(SOURCE)
+        self._layout, self._library = layout, building()
         self.condense = row_function(layout).kernel(compiled=compiled)
         self.missing = missing_function(layout).kernel(compiled=compiled)
         self.close = closing_function(layout).kernel(compiled=compiled)
@@ -252,11 +248,11 @@ class _FusedWorkspace:
     def is_ready(self) -> bool:
         """See :class:`FusedSolver`."""
         if self._is_ready is None:
-            if not self._source.ask():
+            if not self._library.ask():
                 for kernel in self.kernels:
                     kernel.prepare()
                 return False
-            self._is_ready = self._source.library is not None and bool(_daqp())
+            self._is_ready = self._library.library is not None and bool(_daqp())
             if self._is_ready:
                 self._start()
         return self._is_ready
@@ -271,7 +267,13 @@ class _FusedWorkspace:
         """The structure of the C."""
         return self._program.data
 
-    def call(self, name: str, *arguments: float) -> int:
+    @property
+    def address(self) -> int:
+        """Of the structure; uses the kernels compiled meanwhile."""
+        self._program.refresh()
+        return self._program.address
+
+    def call(self, name: str, *arguments: float) -> Code:
         """Call a function of the C, and return its code."""
         return self._program.call(name, *arguments)
 
@@ -280,14 +282,14 @@ class _FusedWorkspace:
         """Name of the solver, and how it ended."""
         return self._other_status or f"daqp (exit flag {self.data.flag})"
 
-    def check(self, code: int) -> int:
+    def check(self, code: Code) -> Code:
         """Return the code that a function returned; raise if there is no answer."""
         failure, self._failure = self._failure, None
         if failure is not None:
             raise failure
-        if code == _FusedCode.INFEASIBLE:
+        if code == Code.INFEASIBLE:
             raise InfeasibleStepError("the hard rows of the step contradict one another")
-        if code == _FusedCode.NO_VALUE:
+        if code == Code.NO_VALUE:
             raise EvaluationError("the rows of the step have no value at its configuration")
         return code
 
@@ -302,10 +304,10 @@ class _FusedWorkspace:
             )
         except Exception as error:  # a solver of the user's own raises anything, and C cannot hand it on
             self._failure = error
-            return _FusedCode.FAILED
+            return Code.FAILED
         self.x[:], self.multipliers[:count] = answer.x, answer.multipliers
         self._other_status, self.data.iterations = answer.status, answer.iterations
-        return _FusedCode.DONE
+        return Code.DONE
 
     def use(self, goals: dict[str, Array]) -> None:
         """Set the goals of control vertices for the next QPs."""
@@ -353,6 +355,16 @@ class _FusedWorkspace:
             self._near_lower[:near] = clearance.lower
         return int(near)
 
+    def near(self, count: int) -> tuple[Index, Array, Array]:
+        """Return nodes (R, 4), coefficients (R, 4, 3) and bounds (R,) of the first rows of clearance."""
+        nodes, rows = self._near_nodes[: 4 * count], self._near_rows[: 12 * count]
+        return nodes.reshape(-1, 4).copy(), rows.reshape(-1, 4, 3).copy(), self._near_lower[:count].copy()
+
+    def reserve(self, near: int) -> None:
+        """Make room for `near` rows of clearance at least."""
+        if near > self._room:
+            self._reserve(near, self._slots)
+
     def closed(self) -> Closed:
         """Return the settled configuration."""
         (_, quantities, errors), (_, position, rotation) = self.close.outputs, self.missing.outputs
@@ -377,7 +389,7 @@ class _FusedWorkspace:
         self.offset, self.normal = out[6].reshape(-1, 3), out[7]
         sums = 16 * (self.actuators + 1)
         work = nodes + sums + size * (rows + size + equal + SETTLING_STEPS + 4) + equal * (equal + 1)
-        self._program = Program(SOURCE, "Fused")
+        self._program = Program("Fused")
         self._program.set(**_numbers(layout), **_daqp(), unknowns=size)
         if self._movers is None:
             stack, self._response = out[0], out[0].reshape(size, rows)[:, :nodes]
@@ -480,6 +492,7 @@ def _numbers(layout: Layout) -> dict[str, Any]:
         "settling_steps": SETTLING_STEPS,
         "closing_steps": MOST_STEPS,
         "too_far": TOO_FAR * arm.unit,
+        "small_error": _SMALL_ERROR * arm.unit,
         "feasibility": DAQP.accuracy * arm.fineness,
         "places": len(place),
         "place": place,

@@ -238,7 +238,7 @@ class Layout:
         return np.where(self.hard_tilts, 0.0, weights)
 
     @cached_property
-    def _end_gain(self) -> Array:
+    def end_gain(self) -> Array:
         """(V, 1 or 2) least changes of the control vertices that move the curve's end, and that turn it."""
         rows = [self.curve_weights[-1], self.curve_slopes[-1]][: 1 + self.ends_along_tip]
         gain = np.zeros((self.vertices, len(rows)))
@@ -257,7 +257,7 @@ class Layout:
         if self.ends_along_tip:
             slope, axis = self.curve_slopes[-1] @ vertices, rotation[:, 2]
             missing.append(math.copysign(float(np.linalg.norm(slope)), slope @ axis) * axis - slope)
-        return np.asarray(vertices + self._end_gain @ np.array(missing))
+        return np.asarray(vertices + self.end_gain @ np.array(missing))
 
     @cached_property
     def legs(self) -> Index:

@@ -18,13 +18,13 @@ from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.target import Target
 
-_LOOSER = 10.0
+LOOSER = 10.0
 """Error of a state that is refused, over the tolerance of settling.
 
 With this factor rounding never decides, and the published tolerances still hold.
 """
 
-_ROUNDING = 64.0 * float(np.finfo(float).eps)
+ROUNDING = 64.0 * float(np.finfo(float).eps)
 """Greatest rounding difference between two computations of a quantity, relative to the configuration's norm."""
 
 
@@ -38,7 +38,7 @@ class Acceptance:
         is_first = np.array_equal(base, np.arange(len(base)))
         self._base: slice | NDArray[np.int64] = slice(len(base)) if is_first else base
         self._least, self._greatest = setup.arm.home_quantities.copy(), setup.arm.home_quantities.copy()
-        self._member, self._tip = _LOOSER * accuracy.member, _LOOSER * accuracy.tip
+        self._member, self._tip = LOOSER * accuracy.member, LOOSER * accuracy.tip
 
     def flaw(
         self,
@@ -60,7 +60,7 @@ class Acceptance:
         curve = norm(vertices.reshape(-1)) + (norm(torsion) if len(torsion) else 0.0)
         if not size + curve < math.inf:
             return "the new state is not finite"
-        rounding = _ROUNDING * size
+        rounding = ROUNDING * size
         X, at = arm.nodes(q), arm.nodes(before if base is None else arm.based(q, base))
         # Nothing moves a base at rest: its nodes must be equal, without a tolerance.
         spare = 0.0 if base is None else self._member + rounding

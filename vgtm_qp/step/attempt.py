@@ -18,7 +18,8 @@ from vgtm_qp.qp.residual import AnswerError, FailedStepError, InfeasibleStepErro
 from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.acceptance import Acceptance
 from vgtm_qp.step.actuation import Actuation
-from vgtm_qp.step.engine import Engine
+from vgtm_qp.step.driver import DEVIATION, LEAP, MOTION_MARGIN, TOO_FAR, Driver, can_drive
+from vgtm_qp.step.engine import Engine, FusedEngine
 from vgtm_qp.step.separation import RECOVERY, Separation
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import Shortfall, State
@@ -33,18 +34,6 @@ _MOST_QPS = 6
 
 _MOST_FRACTIONS = 8
 """Greatest number of times between two states for which a QP has rows."""
-
-_MOTION_MARGIN = 2.5
-"""Ratio of the displacement for which pairs are listed to the expected displacement of a node."""
-
-_TOO_FAR = 1e3
-"""Displacement of a node, over the arm's length, above which a QP's answer shows a singular pose."""
-
-_LEAP = 1.0
-"""Greatest displacement of a control vertex's coordinate in one step, over the arm's length."""
-
-_DEVIATION = 0.1
-"""Greatest deviation of points from their chords in one step, over the arm's length."""
 
 _SETTLING = 5e-3
 """Tip error after a QP, over the arm's length, above which another QP is solved."""
@@ -81,6 +70,13 @@ class Phases:
         self.seconds[phase] += now - self._mark
         self._mark = now
 
+    def take(self, spent: dict[str, float]) -> None:
+        """Add the seconds in `spent`, which are set to zero."""
+        for phase, seconds in spent.items():
+            self.seconds[phase] += seconds
+            spent[phase] = 0.0
+        self.start()
+
 
 class Attempt:
     """Tries one piece of path from one state; keeps the workspaces.
@@ -107,6 +103,8 @@ class Attempt:
     def use(self, setup: Setup) -> None:
         """Go on with the curve of another `setup` of the arm."""
         self._setup = setup
+        self._can_drive = can_drive(setup)
+        self._drivers: dict[Engine, Driver] = {}
 
     @property
     def gives_way(self) -> bool:
@@ -149,6 +147,10 @@ class Attempt:
     ) -> Step:
         """Return an engine's step that drives apart pairs too near, or if that fails keeps their distance."""
         short = self.separation.shortfall_of(state)
+        if self._can_drive and not short and progress == 0.0 and isinstance(engine, FusedEngine):
+            driven = self._driven(state, target, share, engine)
+            if driven is not None:
+                return driven
         for gain in (self._recovery(short), 0.0) if short else (0.0,):
             asked, reach = self._first(state, target, share, progress, short, gain)
             try:
@@ -159,6 +161,21 @@ class Attempt:
             if step.moved:
                 break
         return step
+
+    def _driven(self, state: State, target: Target, share: float, engine: FusedEngine) -> Step | None:
+        """Return the step in one call; None if it is no usual one."""
+        driver = self._drivers.get(engine)
+        if driver is None:
+            driver = self._drivers[engine] = Driver(
+                self._setup, engine, self.accuracy, self.acceptance, self.separation
+            )
+        taken = driver.take(state, target, share)
+        self.phases.take(driver.spent)
+        if taken is None:
+            return None
+        self.qps += 1
+        of_qp = {"qps": 1, "solution": taken.solution, "rows": taken.rows}
+        return self._accepted(taken.state, taken.progress, taken.gap, **of_qp)
 
     def _recovery(self, short: Shortfall) -> float:
         """Return the distance by which pairs that are too near are driven apart, m."""
@@ -185,11 +202,11 @@ class Attempt:
         q, arm, goal, guess = state.q, self._arm, target.goal(progress), share * state.motion
         reach, expected = self._influence, None
         if share >= 1.0:
-            reach = _MOTION_MARGIN * self._expected(target, goal, guess)
+            reach = MOTION_MARGIN * self._expected(target, goal, guess)
         if share >= 1.0 and target.base is None and (last := arm.travel(guess)) > 0.0:
             expected = reach / last * guess
         elif (furthest := self._furthest(q, target)) is not None:
-            expected = _MOTION_MARGIN * furthest
+            expected = MOTION_MARGIN * furthest
         rows = self.separation.rows(q, state.time, target.duration, reach, short, gain, expected=expected)
         if target.base is not None:
             # The displacement of the nodes by the base is known.
@@ -287,14 +304,14 @@ class Attempt:
         """Return why the QP's answer leads too far from `state` for its rows; empty if it does not."""
         height = self._arm.height
         is_finite = move.closed is not None or np.isfinite(move.q).all()
-        if not move.furthest < _TOO_FAR * height or not is_finite:
+        if not move.furthest < TOO_FAR * height or not is_finite:
             return "singular pose"
         leap = np.abs(move.vertices - state.control_vertices).max(initial=0.0)
-        return "" if leap < _LEAP * height else "the curve moves too far in one step"
+        return "" if leap < LEAP * height else "the curve moves too far in one step"
 
     def _stride(self, state: State, q: Array) -> str:
         """Return why the motion from `state` to `q` is too long for one step; empty if it is not."""
-        if not self.separation.deviation(state.q, q) < _DEVIATION * self._arm.height:
+        if not self.separation.deviation(state.q, q) < DEVIATION * self._arm.height:
             return "the arm turns too far in one step"
         return self._too_long(self._arm.nodes(q) - state.nodes) if self._has_limit else ""
 

@@ -299,34 +299,38 @@ class FusedEngine(Engine):
     """One compiled call, for arms whose coordinates can be eliminated one after another.
 
     Until the call is compiled, and without a compiler, an interpreted engine gives the same answers.
+
+    Attributes
+    ----------
+    solver : FusedSolver
     """
 
     def __init__(self, layout: Layout, kinematics: Kinematics, task: TipTask, solver: FusedSolver) -> None:
         super().__init__(layout)
         self._kinematics, self._task = kinematics, task
-        self._solver = solver
+        self.solver = solver
         self._last: QPInput | None = None
 
     @cached_property
     def _plain(self) -> GeneralEngine:
-        solver = CondensedSolver(self.layout, self._solver.solver)
+        solver = CondensedSolver(self.layout, self.solver.solver)
         return GeneralEngine(self.layout, self._kinematics, self._task, solver, compiled=False)
 
     @property
     def is_ready(self) -> bool:
         """Whether the compiled call is there."""
-        return self._solver.is_ready
+        return self.solver.is_ready
 
     def drawn(self, layout: Layout) -> FusedEngine:
         """See :class:`Engine`."""
-        return FusedEngine(layout, self._kinematics, self._task, self._solver.drawn(layout))
+        return FusedEngine(layout, self._kinematics, self._task, self.solver.drawn(layout))
 
     def move(self, asked: QPInput, accuracy: Accuracy, spent: Spent) -> Move:
         """See :class:`Engine`; one compiled call also settles the answer, if it applies.
 
         It does not apply if the path turns within the step, the base moves, or the curve's rows are computed in Python.
         """
-        if not self._solver.is_ready:
+        if not self.solver.is_ready:
             return self._plain.move(asked, accuracy, spent)
         try:
             return self._quick(asked, accuracy, spent)
@@ -336,7 +340,7 @@ class FusedEngine(Engine):
 
     def _quick(self, asked: QPInput, accuracy: Accuracy, spent: Spent) -> Move:
         """Return the move by the compiled call."""
-        target, solver = asked.target, self._solver
+        target, solver = asked.target, self.solver
         solver.aim(accuracy)
         is_straight = target.base is None and target.path.is_straight(target.start, target.end)
         if not is_straight or self.layout.general is not None:
@@ -352,16 +356,16 @@ class FusedEngine(Engine):
 
     def solve(self, asked: QPInput) -> StepSolution:
         """See :class:`Engine`."""
-        self._solver.load(asked.linear(self.layout))
+        self.solver.load(asked.linear(self.layout))
         self._last = asked
-        return self._solver.solve(asked.rows)
+        return self.solver.solve(asked.rows)
 
     def settle(
         self, q: Array, curve: CurvePoint, target: Target, goal: TipGoal, accuracy: Accuracy
     ) -> Settled | None:
         """See :class:`Engine`."""
         if self.layout.general is None:
-            self._solver.aim(accuracy)
-            return self._solver.settle(q, curve, target.lower, target.upper, goal)
+            self.solver.aim(accuracy)
+            return self.solver.settle(q, curve, target.lower, target.upper, goal)
         assert self._last is not None
-        return self._plain.equalities.settle(q, curve, self._last, goal, accuracy, self._solver.gain)
+        return self._plain.equalities.settle(q, curve, self._last, goal, accuracy, self.solver.gain)

@@ -61,6 +61,12 @@ class Separation:
         meeting = setup.monitor.bodies.joints
         self._corners = corners(meeting if setup.minimum_angle > 0.0 else meeting[:0])
 
+    @property
+    def pace(self) -> dict[str, float]:
+        """Share and least of the approach of a slowing pair, m, and the rounding of a clearance, m; for ``step.c``."""
+        least = _LEAST_APPROACH * self._unit
+        return {"share_of_way": self._approach, "least_way": least, "rounding": self._rounding}
+
     def shortfall(self, q: Array, time: float, *, tracked: bool = False) -> Shortfall:
         """Return the pairs that are too near at a configuration; usually there are none.
 

@@ -133,12 +133,15 @@ class Step:
 
     @property
     def fcl_rows(self) -> int:
-        """Number of clearance rows in the QP that moved the arm by FCL, each proven."""
+        """Number of clearance rows in the QP that moved the arm by FCL, each proven; all that press, if it is asked."""
         return 0 if self.rows is None else self.rows.by_fcl
 
     @property
     def exact_rows(self) -> int:
-        """Number of clearance rows by closed forms: FCL unused, its answer refused, or axes touching."""
+        """Number of clearance rows by closed forms: FCL unused, its answer refused, or axes touching.
+
+        Rows of which FCL was not asked, since they do not press, do not count.
+        """
         return 0 if self.rows is None else self.rows.by_formula
 
     @property

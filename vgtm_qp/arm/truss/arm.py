@@ -66,6 +66,10 @@ class TrussArm(Arm):
         """Return the configuration itself."""
         return q
 
+    def straight_quantities(self) -> tuple[Index, Index] | None:
+        """See ``arm.Arm``; with offset joints the ends of members are no nodes."""
+        return (self._first, self._last) if self.truss.joints is None else None
+
     def measured(self, q: Array) -> Array:
         """See ``arm.Arm``: the distances of the members' ends."""
         points = self.points(q)

@@ -6,8 +6,6 @@
 
 #include <daqp/api.h>
 
-enum { DONE, NO_VALUE, INFEASIBLE, INACCURATE, UNSETTLED, FAILED };
-
 typedef struct {
     /* Numbers of: unknowns n; actuators n_a; columns of the free nodes; least-squares rows L; rows of the tip, of
        stations, of legs, of clearance; control vertices, torsion coordinates; coordinates of q. */
@@ -20,7 +18,7 @@ typedef struct {
     /* Distance from a bound, and remaining path, that count as zero; worst condition of a gain. */
     double at_bound, left, worst_condition;
     int settling_steps, closing_steps;
-    double too_far;
+    double too_far, small_error;
     const double *levers;          /* (m) lengths to compare the equalities by */
 
     /* (StepGraph.inputs) -> results of row_function; (q, lower, upper) -> (closer q, quantities, errors);
@@ -262,13 +260,19 @@ static void residuals(Fused *f, int rows)
     f->dual = sqrt(loose > off ? loose : off) / (1.0 + norm(f->gradient, n) + norm(y, n + rows));
 }
 
-/* Condense the QP at the state that was loaded, and solve it. */
-EXPORT int solve(Fused *f)
+/* Condense the QP, but for its rows of clearance, at the state that was loaded. */
+static int assemble(Fused *f)
 {
-    int rows = f->tips + f->hard + f->legs + f->near;
     if (call(&f->condense)) return NO_VALUE;
     if (f->twists) expand(f);
     objective(f);
+    return DONE;
+}
+
+/* Solve the QP that was assembled with its rows of clearance. */
+static int answer(Fused *f)
+{
+    int rows = f->tips + f->hard + f->legs + f->near;
     constrain(f);
     if (f->other) {
         int code = f->other();
@@ -291,6 +295,13 @@ EXPORT int solve(Fused *f)
     if (result.exitflag == EXIT_INFEASIBLE) return INFEASIBLE;
     residuals(f, rows);
     return DONE;
+}
+
+/* Condense the QP at the state that was loaded, and solve it. */
+EXPORT int solve(Fused *f)
+{
+    int code = assemble(f);
+    return code ? code : answer(f);
 }
 
 /* The greatest displacement of a node's coordinate by the changes x of the actuators, with the known motions if `whole`;
@@ -414,30 +425,35 @@ static void change_by(const Fused *f, const Gain *g, const double *missing, doub
     }
 }
 
-/* Settle q and the curve: quantities exact, equalities satisfied. Steps (n) after the first have Broyden's updates of
-   the gain, in the form that needs the steps alone. */
+/* Settle q and the curve: quantities exact, equalities satisfied. Each iteration closes the quantities by a step of
+   Newton's method, and then corrects the equalities: closing again in between would not change what they miss. Steps (n)
+   after the first have Broyden's updates of the gain, in the form that needs the steps alone. */
 EXPORT int settle(Fused *f)
 {
-    int n = f->unknowns, m = f->tips + f->hard, steps = 0, counted = 0;
-    double *step = f->work + f->nodes + SUMS * (f->actuators + 1) + n * f->squares, *work = step + (f->settling_steps + 1) * n;
+    int n = f->unknowns, m = f->tips + f->hard, steps = 0, may_correct = 1, is_measured = 0;
+    double *step = f->work + f->nodes + SUMS * (f->actuators + 1) + n * f->squares;
+    double *work = step + (f->settling_steps + 1) * n;
     Gain gain;
-    for (;;) {
+    for (int count = 0; count <= f->closing_steps + f->settling_steps; count++) {
         if (call(&f->close)) return UNSETTLED;
         /* The norm is NaN if one of the errors is. */
         double error = f->errors[0];
         if (!(error < f->too_far && f->errors[1] < INFINITY)) return UNSETTLED;
-        if (error > f->enough_length && counted++ < f->closing_steps) {
-            memcpy(f->q, f->closer, sizeof(double) * f->coordinates);
-            continue;
-        }
+        int is_closed = error <= f->enough_length;
+        if (!is_closed) memcpy(f->q, f->closer, sizeof(double) * f->coordinates);
+        else if (is_measured) break;
+        if (error > f->small_error) continue;
         if (call(&f->missing)) return UNSETTLED;
         f->off = 0.0;
         for (int k = 0; k < m; k++) f->off += f->levers[k] * f->missed[k] * f->levers[k] * f->missed[k];
         f->off = sqrt(f->off);
         if (!(f->off <= f->start)) return UNSETTLED;
-        if (f->off <= f->enough_tip || steps == f->settling_steps) break;
-        if (!steps && !gain_of(f, &gain, work)) break;
-        counted = 0;
+        is_measured = 1;
+        if (!steps && f->off > f->enough_tip) may_correct = gain_of(f, &gain, work);
+        if (f->off <= f->enough_tip || !may_correct || steps == f->settling_steps) {
+            if (is_closed) break;
+            continue;
+        }
         double *next = step + steps * n;
         change_by(f, &gain, f->missed, next, work + n * n + m * (n + m) + n);
         for (int k = 0; k < steps; k++) {
@@ -450,15 +466,14 @@ EXPORT int settle(Fused *f)
         }
         steps++;
         advance(f, next, 0);
+        is_measured = 0;
     }
-    return f->errors[0] <= f->member && f->off <= f->tip ? DONE : UNSETTLED;
+    return is_measured && f->errors[0] <= f->member && f->off <= f->tip ? DONE : UNSETTLED;
 }
 
-/* Solve, follow the answer from q, and settle. */
-EXPORT int move(Fused *f, double tolerance)
+/* Follow the answer of the QP from q, and settle. */
+static int depart(Fused *f, double tolerance)
 {
-    int code = solve(f);
-    if (code) return code;
     if (!(f->primal <= tolerance && f->dual <= tolerance)) return INACCURATE;
     double before = *f->progress, reached = fmin(fmax(before + f->x[f->unknowns - 1], 0.0), 1.0), fastest = 0.0;
     for (int k = 0; k < 3; k++) fastest = fmax(fastest, fmax(fabs(f->velocity[k]), fabs(f->spin[k])));
@@ -473,8 +488,15 @@ EXPORT int move(Fused *f, double tolerance)
     memcpy(f->started, f->q, sizeof(double) * f->coordinates);
     memcpy(f->started_points, f->points, sizeof(double) * 3 * f->vertices);
     double furthest = f->furthest;
-    code = settle(f);
+    int code = settle(f);
     /* Not that of the last correction, which may have failed. */
     f->furthest = furthest;
     return code;
+}
+
+/* Solve, follow the answer from q, and settle. */
+EXPORT int move(Fused *f, double tolerance)
+{
+    int code = solve(f);
+    return code ? code : depart(f, tolerance);
 }

@@ -2,9 +2,7 @@
 
 /* Lengths of the arrays of follow_function: ends of a pair before and after a motion; known, whose last three
    numbers are a normal; the two contacts, whose normals are numbers 5 to 7 of each, from 0. */
-enum { ENDS = 24, KNOWN = 19, KNOWN_NORMAL = 16, CONTACTS = 18, NORMAL = 5 };
-
-enum { DONE, NO_VALUE, TOO_FAR, NOT_PROVEN };
+enum { ENDS = 24, KNOWN = 19, KNOWN_NORMAL = 16, CONTACTS = 18, CONTACT = 9, NORMAL = 5 };
 
 /* The lesser of two numbers; NaN if either is NaN. */
 static double least_of(double a, double b)
@@ -43,14 +41,19 @@ typedef struct {
     const double *places;            /* (K + 1, P, 3) */
     double furthest;                 /* bound of the sum of the squares of displacements */
     Pairs **group;                   /* (G) */
-    const double *floors, *limits;   /* (G): distance to prove; at the end, distance to evaluate below */
+    /* Distances to prove from pieces and between bodies, and those below which pairs are evaluated at the end. */
+    double floor, self_floor, limit, self_limit;
+
+    double *place;                   /* (P, 3): the present one, where pairs nearer than the reach are evaluated */
+    double reach, self_reach, wanted, self_wanted;    /* wanted: the reach of the next place */
+    int lost;                        /* whether a pair had no value, so that nothing is known of any */
 
     double *middle, *turned, *moved; /* (B, 3), (B), (B): of each axis in the present piece the displacement
                                         of its middle, half that between its ends, the greater of its ends' */
     int done;                        /* number of pieces that were followed */
 } Way;
 
-static void move(Way *w, const double *before, const double *after)
+static void displace(Way *w, const double *before, const double *after)
 {
     for (int b = 0; b < w->bodies; b++) {
         double square[3] = {0.0, 0.0, 0.0};
@@ -121,7 +124,8 @@ static int evaluate(const Way *w, Pairs *p, double floor, double limit, double r
     return DONE;
 }
 
-/* Follow the path to its end, or to the end of the first piece that is not proven to keep the floors. */
+/* Follow the path to its end, or to the end of the first piece that is not proven to keep the floors. The place that is
+   reached becomes the present one. */
 EXPORT int follow(Way *w)
 {
     int step = 3 * w->points, is_proven = 1;
@@ -132,15 +136,30 @@ EXPORT int follow(Way *w)
     while (is_proven && w->done < w->pieces) {
         const double *before = w->places + w->done * step, *after = before + step;
         int is_last = ++w->done == w->pieces;
-        move(w, before, after);
+        displace(w, before, after);
         for (int g = 0; g < w->groups; g++) {
             Pairs *pairs = w->group[g];
             /* Before the last place only the floor matters. */
-            double floor = w->floors[g], limit = is_last ? w->limits[g] : floor;
+            double floor = pairs->is_self ? w->self_floor : w->floor;
+            double limit = !is_last ? floor : pairs->is_self ? w->self_limit : w->limit;
             double reach = is_last ? fmax(limit, pairs->next * limit) : limit;
-            if (evaluate(w, pairs, floor, limit, reach, before, after)) return NO_VALUE;
+            if (evaluate(w, pairs, floor, limit, reach, before, after)) {
+                w->lost = 1;
+                return NO_VALUE;
+            }
             if (!(pairs->lowest >= floor)) is_proven = 0;
         }
     }
+    memcpy(w->place, w->places + w->done * step, sizeof(double) * step);
+    w->reach = w->done == w->pieces ? w->limit : w->floor;
+    w->self_reach = w->done == w->pieces ? w->self_limit : w->self_floor;
     return is_proven ? DONE : NOT_PROVEN;
+}
+
+/* Follow the path as follow does, and evaluate the pairs that are wanted at its end. */
+static int advance_pairs(Way *w)
+{
+    w->limit = fmax(w->wanted, w->floor);
+    w->self_limit = fmax(w->self_wanted, w->self_floor);
+    return follow(w);
 }

@@ -1,4 +1,4 @@
-/* The beginning of all our C sources: native.py puts it before each. */
+/* The beginning of our C: what follows it in one text are pairs.c, qp.c and step.c. */
 
 #include <math.h>
 #include <string.h>
@@ -6,6 +6,12 @@
 #define EXPORT __attribute__((visibility("default")))
 
 typedef long long Index;
+
+/* What functions return; see Code in __init__.py. */
+enum {
+    DONE, NO_VALUE, INFEASIBLE, INACCURATE, UNSETTLED, FAILED, TOO_FAR, NOT_PROVEN, ELSEWHERE, CROWDED, OVERLAPPING,
+    ASKS, FLAWED, OFF_CURVE
+};
 
 /* A function that CasADi generates, with its arguments, results and workspaces. */
 typedef struct {

@@ -1,13 +1,14 @@
-"""Our own C: sources beside their Python, compiled once, called with structures of numbers and addresses.
+"""Our own C: one library of all sources in this folder, called with structures of numbers and addresses.
 
-A source declares the structures that its functions take. :func:`structure` reads their fields from the
-source, which so is their only definition.
+The sources declare the structures that their functions take. :func:`structure` reads the fields from there, their only
+definition. ``pairs.c`` knows which bodies may have come near, ``qp.c`` the QP of a step, ``step.c`` the whole step.
 """
 
 from __future__ import annotations
 
 import ctypes
 import re
+from enum import IntEnum
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -22,10 +23,31 @@ _STRUCT = re.compile(r"typedef struct \{((?:(?!typedef).)*?)\} (\w+);", re.DOTAL
 _COMMENT = re.compile(r"/\*.*?\*/", re.DOTALL)
 _FUNCTION_POINTER = re.compile(r"\(\*(\w+)\)")
 
-_HEADER = Path(__file__).with_suffix(".h")
+_SOURCES = tuple(Path(__file__).with_name(name) for name in ("base.h", "pairs.c", "qp.c", "step.c"))
 
 INCLUDES = Path(ca.__file__).parent / "include"
 """Headers of the libraries in CasADi's wheel, DAQP's among them."""
+
+
+class Code(IntEnum):
+    """What the functions of the library return; see ``base.h``."""
+
+    (
+        DONE,
+        NO_VALUE,
+        INFEASIBLE,
+        INACCURATE,
+        UNSETTLED,
+        FAILED,
+        TOO_FAR,
+        NOT_PROVEN,
+        ELSEWHERE,
+        CROWDED,
+        OVERLAPPING,
+        ASKS,
+        FLAWED,
+        OFF_CURVE,
+    ) = range(14)
 
 
 class CompiledKernel(ctypes.Structure):
@@ -38,11 +60,14 @@ _TYPES: dict[str, Any] = {"int": ctypes.c_int, "double": ctypes.c_double, "Kerne
 
 
 @cache
-def structure(source: Path, name: str) -> type[ctypes.Structure]:
-    """Return the structure of that `name` in a C source as a class of ctypes; its pointers are addresses."""
-    body = next(
-        match[1] for match in _STRUCT.finditer(source.read_text(encoding="utf-8")) if match[2] == name
-    )
+def _text() -> str:
+    return "".join(source.read_text(encoding="utf-8") for source in _SOURCES)
+
+
+@cache
+def structure(name: str) -> type[ctypes.Structure]:
+    """Return the structure of that `name` in our C as a class of ctypes; its pointers are addresses."""
+    body = next(match[1] for match in _STRUCT.finditer(_text()) if match[2] == name)
     fields: list[tuple[str, Any]] = []
     for declaration in _COMMENT.sub("", body).split(";"):
         words = declaration.replace("const ", "").split(None, 1)
@@ -58,19 +83,18 @@ def structure(source: Path, name: str) -> type[ctypes.Structure]:
     return type(name, (ctypes.Structure,), {"_fields_": fields})
 
 
-def building(source: Path) -> Building:
-    """Begin to compile a C source, once in a process for each compiler."""
-    return _building(source, compiler(), cache_directory())
+def building() -> Building:
+    """Begin to compile the library, once in a process for each compiler."""
+    return _building(compiler(), cache_directory())
 
 
 @cache
-def _building(source: Path, *_: object) -> Building:
-    text = "".join(file.read_text(encoding="utf-8") for file in (_HEADER, source))
-    return Building(source.stem, text, (f"-I{INCLUDES}",))
+def _building(*_: object) -> Building:
+    return Building("native", _text(), (f"-I{INCLUDES}",))
 
 
 class Program:
-    """Functions of a C source that share one structure, and the arrays and kernels that it points to.
+    """A structure for functions of the library, and the arrays and kernels that it points to.
 
     Attributes
     ----------
@@ -81,15 +105,15 @@ class Program:
     Raises
     ------
     OSError
-        The source could not be compiled.
+        The library could not be compiled.
     """
 
-    def __init__(self, source: Path, name: str) -> None:
-        library = building(source).finish()
+    def __init__(self, name: str) -> None:
+        library = building().finish()
         if library is None:
-            raise OSError(f"{source.name} could not be compiled")
+            raise OSError("our C could not be compiled")
         self._library = ctypes.CDLL(str(library))
-        self.data = structure(source, name)()
+        self.data = structure(name)()
         self.address = ctypes.addressof(self.data)
         self._kept: dict[str, Any] = {}
         self._interpreted: dict[str, Kernel] = {}
@@ -117,11 +141,10 @@ class Program:
         if self._interpreted:
             self.set(**{key: kernel for key, kernel in self._interpreted.items() if kernel.is_done})
 
-    def call(self, name: str, *arguments: float) -> int:
+    def call(self, name: str, *arguments: float) -> Code:
         """Call the C function of that name with the structure and numbers; kernels compiled meanwhile are used."""
         self.refresh()
-        code: int = self._library[name](ctypes.c_void_p(self.address), *map(ctypes.c_double, arguments))
-        return code
+        return Code(self._library[name](ctypes.c_void_p(self.address), *map(ctypes.c_double, arguments)))
 
 
 _EVALUATION = ctypes.CFUNCTYPE(ctypes.c_int, *[ctypes.c_void_p] * 4, ctypes.c_int)
@@ -137,10 +160,13 @@ def _interpreted(kernel: Kernel) -> tuple[CompiledKernel, list[Any]]:
             return 1
         return 0
 
-    arg = np.array([array.ctypes.data for array in kernel.inputs], dtype=np.uintp)
+    arg, res = (
+        np.array([array.ctypes.data for array in arrays], dtype=np.uintp)
+        for arrays in (kernel.inputs, kernel.outputs)
+    )
     function = _EVALUATION(evaluate)
     address = ctypes.cast(function, ctypes.c_void_p).value
-    return CompiledKernel(address, arg.ctypes.data, 0, 0, 0), [function, arg]
+    return CompiledKernel(address, arg.ctypes.data, res.ctypes.data, 0, 0), [function, arg, res]
 
 
 def _compiled(kernel: Kernel) -> tuple[CompiledKernel, list[Any]]:

@@ -1,0 +1,186 @@
+"""The step in one call of C takes the same steps as an attempt, and accepts nothing that an attempt would refuse."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+from recorded_states import CASES
+from steps import drives_nothing
+
+import vgtm_qp as vq
+from vgtm_qp.compiled import compiler
+from vgtm_qp.native import building
+from vgtm_qp.qp import fused
+from vgtm_qp.step.driver import Driver
+from vgtm_qp.study.scenes import random_scene
+from vgtm_qp.study.serial_scenes import random_serial_scene
+
+pytestmark = pytest.mark.skipif(compiler() is None, reason="no C compiler")
+
+SAME = 1e-10
+"""Greatest difference of two steps, m; that of solvers that only come near is a hundred times as large."""
+
+NAMES = [name for name, case in CASES.items() if case.load().method.name == "qp"]
+
+
+@pytest.fixture
+def driven(monkeypatch) -> list[bool]:
+    """Whether each of the steps that was offered so far was taken in one call."""
+    assert building().finish() is not None
+    found, take = list[bool](), Driver.take
+
+    def counted(self, *asked):
+        taken = take(self, *asked)
+        found.append(taken is not None)
+        return taken
+
+    monkeypatch.setattr(Driver, "take", counted)
+    return found
+
+
+def without(problem: vq.Problem) -> vq.Resolver:
+    """A resolver whose steps are attempts alone."""
+    with pytest.MonkeyPatch.context() as patch:
+        drives_nothing(patch)
+        return vq.Resolver(problem)
+
+
+def goals(resolver: vq.Resolver, rng: np.random.Generator, count: int) -> Iterator[dict[str, object]]:
+    """Goals near the tip; far ones among them, so that rows press."""
+    for _ in range(count):
+        position, rotation = resolver.tip()
+        size = rng.choice([0.005, 0.03, 0.3], p=[0.3, 0.5, 0.2]) * resolver.setup.arm.unit
+        goal: dict[str, object] = {}
+        if len(resolver.setup.task.axes):
+            goal["position"] = position + size * rng.normal(size=3)
+        if resolver.setup.task.turns == "pointing":
+            goal["pointing"] = rotation[:, 2] + 0.05 * rng.normal(size=3)
+        yield goal
+
+
+def assert_same(one: vq.Step, other: vq.Step, tolerance: float) -> None:
+    assert one.status == other.status
+    assert one.progress == pytest.approx(other.progress, abs=1e3 * tolerance)
+    for name in ("time", "q", "nodes", "control_vertices", "quantities", "motion", "duration", "late"):
+        np.testing.assert_allclose(
+            getattr(one.state, name), getattr(other.state, name), rtol=0.0, atol=tolerance, err_msg=name
+        )
+    rates = one.state.duration * (one.state.rates - other.state.rates)
+    np.testing.assert_allclose(rates, 0.0, atol=tolerance)
+    assert one.gave_way == other.gave_way
+    assert one.gap == pytest.approx(other.gap, abs=tolerance, nan_ok=True)
+    assert pressing(one) == pytest.approx(pressing(other), rel=1e-5, abs=1e3 * tolerance)
+
+
+def pressing(step: vq.Step) -> dict[str, float]:
+    """Multipliers of the active rows: those of clearance by obstacle, since bodies that meet press for each other."""
+    found: dict[str, float] = {}
+    for name, multiplier in step.multipliers.items():
+        kind = name.split(" / ")[-1] if name.startswith("clearance") else name
+        found[kind] = found.get(kind, 0.0) + multiplier
+    return found
+
+
+def compare(problem: vq.Problem, rng: np.random.Generator, count: int, tolerance: float) -> None:
+    one, other = vq.Resolver(problem), without(problem)
+    brakes = bool(np.isfinite(one.setup.arm.acceleration).any())
+    for goal in goals(one, rng, count):
+        other.state = one.state
+        before = one.state
+        found, expected = one.step(**goal), other.step(**goal)
+        if brakes and not found.status == expected.status == vq.StepStatus.REACHED:
+            # The other arm does not know how this one was to brake.
+            break
+        assert_same(found, expected, tolerance)
+        assert (one.state is before) == (not found.moved)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_it_takes_the_steps_of_an_attempt(name, driven, rng):
+    problem = CASES[name].load()
+    iterative = problem.method.solver != "daqp"
+    compare(problem, rng, 10, (100.0 if iterative else 1.0) * SAME)
+
+
+@pytest.mark.parametrize("name", ["snake_past_a_cube", "twelve_joints_past_a_crate"])
+def test_it_takes_the_steps_of_serial_arms(name, driven, rng):
+    problem = vq.load_problem(name)
+    compare(problem, rng, 10, SAME)
+    assert any(driven)
+
+
+@pytest.mark.parametrize("number", range(12))
+def test_it_takes_the_steps_of_random_arms(number, driven, rng):
+    seed = int(rng.integers(2**31))
+    compare(random_scene(seed, number, steps=10).problem, rng, 8, SAME)
+    serial = random_serial_scene(seed, number, steps=10)
+    if serial.arm_table.bodies != "hull":
+        compare(serial, rng, 8, SAME)
+
+
+def test_most_steps_are_usual(driven):
+    maneuver = vq.solve(vq.load_problem("five_bay_two_cubes"))
+    assert maneuver.certificate.ok
+    assert len(driven) >= 20
+    assert np.mean(driven) > 0.9
+
+
+def lying(make, change):
+    """A function like `make`, whose results are what `change` makes of those."""
+
+    def made(layout):
+        honest = make(layout)
+        inputs = honest.function.mx_in()
+        results = [ca.densify(result) for result in change(*inputs[:3], *honest.function(*inputs))]
+        function = ca.Function(f"lying_{honest.function.name()}", inputs, results)
+        return replace(honest, function=function)
+
+    return made
+
+
+def moved(node):
+    way = np.zeros((3, 18))
+    way[:, node] = 1e-6
+
+    def change(q, lower, upper, closer, quantities, errors):
+        return (
+            closer + ca.DM(way),
+            quantities,
+            ca.if_else(ca.norm_inf(ca.vec(closer - q)) < 1e-5, 0.0, errors),
+        )
+
+    return change
+
+
+LIES = {
+    "closed at once": (
+        "closing_function",
+        lambda q, lower, upper, closer, lengths, _: (closer, lengths, ca.DM(2, 1)),
+    ),
+    "other lengths": (
+        "closing_function",
+        lambda q, lower, upper, closer, lengths, errors: (closer, lengths + 1e-6, errors),
+    ),
+    "the base moved": ("closing_function", moved(0)),
+    "a node moved": ("closing_function", moved(9)),
+    "at the goal": ("missing_function", lambda *all: (0.0 * all[3], *all[4:])),
+}
+
+
+@pytest.mark.parametrize("lie", LIES)
+def test_a_state_that_is_not_what_it_is_said_to_be_is_refused(lie, driven, monkeypatch):
+    name, change = LIES[lie]
+    monkeypatch.setattr(fused, name, lying(getattr(fused, name), change))
+    resolver = vq.Resolver(vq.load_problem("five_bay_free").replace({"method.tracking_mode": "elastic"}))
+    # At home nothing has to be settled.
+    driven.clear()
+    before = resolver.state
+    step = resolver.step(position=resolver.tip()[0] + np.array([0.15, 0.0, -0.05]))
+    assert step.status is vq.StepStatus.BLOCKED
+    assert resolver.state is before
+    assert driven
+    assert not any(driven)

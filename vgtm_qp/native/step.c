@@ -1,0 +1,322 @@
+/* A step of an arm in one call: near pairs, QP, settling, the checks of the new state and the proof of the way there.
+
+   It is for arms whose bodies are spanned by their nodes, among pairs that a Way holds. The caller fills in goal and
+   boxes among the arguments of the QP's function. Anything unusual ends the step with a code and leaves the state as it
+   was; the caller then takes the step by other means. */
+
+#include <time.h>
+
+typedef struct {
+    Fused *fused;
+    Way *way;                      /* null if no two bodies, and no body and piece, can ever be near */
+    Kernel place;                  /* (q) -> (N, 3) nodes; eval is null where the nodes are q */
+
+    /* Numbers of: coordinates of the nodes; quantities; the base's nodes and their numbers; the axes of the tip's
+       position, and these. */
+    int width, quantities, based;
+    const int *base;
+    int axes;
+    const int *axis;
+    /* Whether quantities are the distances of nodes, so that they are measured here; otherwise the caller does that. Whether
+       bodies move on straight lines between two states, so that the way is proven here. */
+    int measures, proves;
+    const int *first, *last, *actuator;    /* (M), (M): ends of members; (n_a) */
+    const double *home;                    /* (M) */
+    const double *levers;                  /* (coordinates) bounds of how far a node moves per change of each; or null */
+    const double *tip_weight;              /* (K) of the tip's nodes */
+    const int *tip_node;
+    int tip_nodes;
+
+    /* The curve: tracked stations S with their nodes and weights (S, 3), weights (S, V) of their places on it; weights and
+       slopes (V) of its end, and the gain (V, 1 or 2) from the errors of place and slope there. */
+    int stations, ends_at_tip, ends_along_tip, must_track;
+    const int *station_node;
+    const double *station_weight, *curve_weight, *curve_slope, *end_gain;
+    const double *normal;                  /* (3) of the base */
+
+    /* Clearances, the margin of their rows, the distance of pairs that are far, share and least of a pair's approach;
+       rounding of a distance. */
+    double safe, self_safe, margin, influence, share_of_way, least_way, rounding;
+    int asks;                              /* whether another program supplies the contacts that may press */
+    double pressing;                       /* multiplier above which a row does */
+    /* Ratio of the displacement for which pairs are listed to the expected one; share of the last motion expected;
+       and that of the limits of pairs that the next step may have. */
+    double motion_margin, share, ahead;
+    /* Greatest displacements of nodes and of control vertices; tolerances of a state: of quantities, of the tip, of
+       stations on the curve, and rounding over the configuration's norm. */
+    double furthest, leap, member, tip, tracking, relative;
+    double tolerance;                      /* of the QP's residuals */
+
+    /* The state, and the next one: q, nodes, (V, 3) control vertices, quantities, the last motion of q; of the next also
+       the rates of the quantities over the duration. */
+    double *q, *nodes, *vertices, *values, *motion;
+    double *next_q, *next_nodes, *next_vertices, *next_values, *next_motion, *next_rates;
+    double duration;
+    double *places;                        /* (2, N, 3) */
+
+    /* Rows of clearance: their contacts (R, 9), numbers of group and pair, and whether they were asked for. */
+    int room, asking;
+    double *contacts;
+    int *group, *pair, *asked;
+
+    double limit, self_limit, gap;
+    double distance, qp, acceptance;       /* s spent in each phase so far */
+} StepData;
+
+static double now(void)
+{
+    struct timespec t;
+    clock_gettime(CLOCK_MONOTONIC, &t);
+    return (double)t.tv_sec + 1e-9 * (double)t.tv_nsec;
+}
+
+static void spend(double *phase, double *mark)
+{
+    double time = now();
+    *phase += time - *mark;
+    *mark = time;
+}
+
+/* The row of contact k: eq. of rows/clearance.py, limited so that a zero step is allowed and pairs slow down. */
+static void clearance_row(StepData *s, int k)
+{
+    Fused *f = s->fused;
+    const double *contact = s->contacts + CONTACT * k, *normal = contact + NORMAL;
+    const Pairs *p = s->way->group[s->group[k]];
+    for (int i = 0; i < 4; i++) {
+        ((Index *)f->near_nodes)[4 * k + i] = p->points[4 * s->pair[k] + i];
+        for (int a = 0; a < 3; a++) ((double *)f->near_rows)[12 * k + 3 * i + a] = contact[1 + i] * normal[a];
+    }
+    double lower = (p->is_self ? s->self_safe : s->safe) + s->margin - contact[0];
+    lower = fmin(lower, 2.0 * s->margin);
+    ((double *)f->near_lower)[k] = fmax(lower, fmin(s->share_of_way * lower, -s->least_way));
+}
+
+/* The rows of all contacts nearer than the limits. */
+static int list_rows(StepData *s)
+{
+    Way *w = s->way;
+    int count = 0;
+    s->fused->slots = 4;
+    s->fused->near = 0;
+    if (!w) return DONE;
+    if (!(s->limit <= w->reach && s->self_limit <= w->self_reach)
+        || memcmp(w->place, s->nodes, sizeof(double) * s->width))
+        return ELSEWHERE;
+    for (int g = 0; g < w->groups; g++) {
+        const Pairs *p = w->group[g];
+        double limit = p->is_self ? s->self_limit : s->limit;
+        if (p->near && p->overlaps) return OVERLAPPING;
+        for (int i = 0; i < 2 * p->near; i++) {
+            const double *contact = p->contacts + CONTACT * i;
+            if (!(contact[0] < limit)) continue;
+            if (count == s->room) return CROWDED;
+            memcpy(s->contacts + CONTACT * count, contact, CONTACT * sizeof(double));
+            s->group[count] = g;
+            s->pair[count] = (int)p->rows[i >> 1];
+            s->asked[count] = 0;
+            clearance_row(s, count++);
+        }
+    }
+    s->fused->near = count;
+    return DONE;
+}
+
+/* Write the point at which the QP is linearised: residuals at q, Jacobians in the middle of the expected motion. */
+static void load(StepData *s)
+{
+    Fused *f = s->fused;
+    double **arg = (double **)f->condense.arg;
+    memcpy(arg[0], s->q, sizeof(double) * f->coordinates);
+    for (int i = 0; i < f->coordinates; i++) arg[1][i] = s->q[i] + 0.5 * s->share * s->motion[i];
+    memcpy(arg[2], s->nodes, sizeof(double) * s->width);
+    memcpy(arg[3], s->vertices, sizeof(double) * 3 * f->vertices);
+    arg[6][0] = 1.0;
+    arg[7][0] = 0.0;
+}
+
+/* Set the distances below which pairs can become active in the step. */
+static void look_ahead(StepData *s)
+{
+    Fused *f = s->fused;
+    double last = 0.0, asked = 0.0, reach = s->influence;
+    for (int i = 0; i < f->coordinates; i++) {
+        double moved = fabs(s->share * s->motion[i]);
+        last = s->levers ? last + moved * s->levers[i] : fmax(last, moved);
+    }
+    for (int a = 0; a < 3; a++) asked = fmax(asked, fabs(f->velocity[a]));
+    if (s->share >= 1.0) reach = s->motion_margin * (last == 0.0 ? s->influence : fmax(last, asked));
+    s->limit = fmin(s->influence, s->safe + reach);
+    s->self_limit = fmin(s->influence, s->self_safe + 2.0 * reach);
+}
+
+/* Mark the rows that press and whose contacts nobody was asked for yet. */
+static int who_presses(StepData *s)
+{
+    Fused *f = s->fused;
+    const double *multiplier = f->multipliers + f->unknowns + f->tips + f->hard + f->legs;
+    s->asking = 0;
+    for (int k = 0; k < f->near; k++)
+        if (!s->asked[k] && fabs(multiplier[k]) > s->pressing) {
+            s->asked[k] = 1;
+            s->asking++;
+        } else if (s->asked[k]) s->asked[k] = 2;
+    return s->asking;
+}
+
+/* Whether the state that was settled keeps its quantities, its limits and its goal, measured anew by plain arithmetic. */
+static int is_flawless(StepData *s)
+{
+    Fused *f = s->fused;
+    const double *x = s->next_nodes, *lower = f->condense.arg[4], *upper = f->condense.arg[5];
+    double rounding = s->relative * norm(f->q, f->coordinates), beyond = 0.0, wrong = 0.0, off = 0.0;
+    for (int i = 0; i < s->based; i++)
+        for (int a = 0; a < 3; a++)
+            if (x[3 * s->base[i] + a] != s->nodes[3 * s->base[i] + a]) return 0;
+    for (int m = 0, k = 0; m < s->quantities; m++) {
+        double length = sqrt(square_of(x + 3 * s->first[m], x + 3 * s->last[m]));
+        int is_actuator = k < f->actuators && s->actuator[k] == m;
+        double least = is_actuator ? lower[k] : s->home[m], greatest = is_actuator ? upper[k] : s->home[m];
+        double out = fmax(length - greatest, least - length);
+        if (!(out <= 0.0)) beyond += out * out;
+        wrong += (length - s->next_values[m]) * (length - s->next_values[m]);
+        k += is_actuator;
+    }
+    for (int i = 0; i < s->axes; i++) {
+        double error = f->condense.arg[8][s->axis[i]] + *f->gone * f->velocity[s->axis[i]];
+        for (int k = 0; k < s->tip_nodes; k++) error -= s->tip_weight[k] * x[3 * s->tip_node[k] + s->axis[i]];
+        off += error * error;
+    }
+    /* NaN fails the comparisons. */
+    return sqrt(beyond) <= s->member + rounding && sqrt(wrong) <= s->member + rounding && sqrt(off) <= s->tip + rounding;
+}
+
+/* The curve's end, which linear rows leave a small way from the tip, is moved there; see Layout.ended. */
+static void end_curve(StepData *s)
+{
+    const Fused *f = s->fused;
+    const double *position = f->missing.res[1], *axis = f->missing.res[2] + 6, *points = f->points;
+    int errors = 1 + s->ends_along_tip;
+    double missing[6], slope[3] = {0.0, 0.0, 0.0};
+    memcpy(s->next_vertices, points, sizeof(double) * 3 * f->vertices);
+    if (!s->ends_at_tip) return;
+    memcpy(missing, position, sizeof(double) * 3);
+    const double *weight = s->curve_weight + (s->stations - 1) * f->vertices;
+    for (int v = 0; v < f->vertices; v++)
+        for (int a = 0; a < 3; a++) {
+            missing[a] -= weight[v] * points[3 * v + a];
+            slope[a] += s->curve_slope[v] * points[3 * v + a];
+        }
+    double along = copysign(norm(slope, 3), dot(slope, axis, 3));
+    for (int a = 0; a < 3; a++) missing[3 + a] = along * axis[a] - slope[a];
+    for (int v = 0; v < f->vertices; v++)
+        for (int a = 0; a < 3; a++)
+            for (int e = 0; e < errors; e++) s->next_vertices[3 * v + a] += s->end_gain[errors * v + e] * missing[3 * e + a];
+}
+
+/* Whether the curve begins against the base's normal, or ends against the tip's. */
+static int reverses(const StepData *s)
+{
+    const Fused *f = s->fused;
+    const double *v = s->next_vertices, *end = v + 3 * (f->vertices - 2), *axis = f->missing.res[2] + 6;
+    if (!f->legs) return 0;
+    double first = 0.0, last = 0.0;
+    for (int a = 0; a < 3; a++) {
+        first += (v[3 + a] - v[a]) * s->normal[a];
+        last += (end[3 + a] - end[a]) * axis[a];
+    }
+    return first < 0.0 || (s->ends_along_tip && last < 0.0);
+}
+
+/* The greatest distance of a station from its place on the curve; NaN stays. */
+static double greatest_gap(const StepData *s)
+{
+    const Fused *f = s->fused;
+    double worst = 0.0;
+    for (int k = 0; k < s->stations; k++) {
+        double square = 0.0;
+        for (int a = 0; a < 3; a++) {
+            double off = 0.0;
+            for (int i = 0; i < 3; i++)
+                off += s->station_weight[3 * k + i] * s->next_nodes[3 * s->station_node[3 * k + i] + a];
+            for (int v = 0; v < f->vertices; v++) off -= s->curve_weight[k * f->vertices + v] * s->next_vertices[3 * v + a];
+            square += off * off;
+        }
+        if (square > worst || square != square) worst = square;
+    }
+    return sqrt(worst);
+}
+
+/* Check where the answer led, and prove the way there. */
+static int arrive(StepData *s)
+{
+    Fused *f = s->fused;
+    Way *w = s->way;
+    double furthest = 0.0;
+    if (!(f->furthest < s->furthest)) return FLAWED;
+    for (int k = 0; k < 3 * f->vertices; k++) furthest = fmax(furthest, fabs(f->points[k] - s->vertices[k]));
+    if (!(furthest < s->leap && norm(f->q, f->coordinates) + norm(f->points, 3 * f->vertices) < INFINITY)) return FLAWED;
+    memcpy(s->next_q, f->q, sizeof(double) * f->coordinates);
+    memcpy(s->next_nodes, f->q, s->place.eval ? 0 : sizeof(double) * s->width);
+    if (s->place.eval) {
+        memcpy((double *)s->place.arg[0], f->q, sizeof(double) * f->coordinates);
+        if (call(&s->place)) return NO_VALUE;
+        memcpy(s->next_nodes, s->place.res[0], sizeof(double) * s->width);
+    }
+    memcpy(s->next_values, f->close.res[1], sizeof(double) * s->quantities);
+    if (s->measures && !is_flawless(s)) return FLAWED;
+    end_curve(s);
+    if (reverses(s)) return FLAWED;
+    s->gap = greatest_gap(s);
+    if (s->must_track && !(s->gap <= s->tracking)) return OFF_CURVE;
+    for (int i = 0; i < f->coordinates; i++) s->next_motion[i] = s->next_q[i] - s->q[i];
+    for (int m = 0; m < s->quantities; m++) s->next_rates[m] = (s->next_values[m] - s->values[m]) / s->duration;
+    if (!w || !s->proves) return DONE;
+    memcpy(s->places, s->nodes, sizeof(double) * s->width);
+    memcpy(s->places + s->width, s->next_nodes, sizeof(double) * s->width);
+    w->pieces = 1;
+    w->places = s->places;
+    w->floor = s->safe - s->rounding;
+    w->self_floor = fmax(s->self_safe - s->rounding, 0.0);
+    return advance_pairs(w);
+}
+
+/* Answer the QP; go there, unless rows press whose contacts are to be asked for first. */
+static int proceed(StepData *s, double *mark)
+{
+    int code = answer(s->fused);
+    if (!code && s->asks && who_presses(s)) code = ASKS;
+    else if (!code) code = depart(s->fused, s->tolerance);
+    spend(&s->qp, mark);
+    if (code) return code;
+    code = arrive(s);
+    spend(&s->acceptance, mark);
+    return code;
+}
+
+/* Take the step from the state. */
+EXPORT int take(StepData *s)
+{
+    double mark = now();
+    look_ahead(s);
+    int code = list_rows(s);
+    spend(&s->distance, &mark);
+    if (code) return code;
+    if (s->way) {
+        s->way->wanted = s->ahead * s->limit;
+        s->way->self_wanted = s->ahead * s->self_limit;
+    }
+    load(s);
+    code = assemble(s->fused);
+    spend(&s->qp, &mark);
+    return code ? code : proceed(s, &mark);
+}
+
+/* Go on with a step that asked for contacts. */
+EXPORT int resume(StepData *s)
+{
+    double mark = now();
+    for (int k = 0; k < s->fused->near; k++)
+        if (s->asked[k] == 1) clearance_row(s, k);
+    return proceed(s, &mark);
+}

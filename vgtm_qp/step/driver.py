@@ -1,0 +1,329 @@
+"""The usual step in one call of C: from a state and its target to the next state and the proof of the way there.
+
+It takes the same step as an attempt of :mod:`vgtm_qp.step.attempt`, in a third of the time. What is unusual it leaves
+to that: pairs that are too near already, obstacles that move, meshes and hulls, angles, a moving base, a path that
+bends within the step, a second QP. See ``native/step.c``.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from time import perf_counter
+from typing import NamedTuple
+
+import numpy as np
+
+from vgtm_qp.arrays import Array
+from vgtm_qp.geometry.exact import CONTACT
+from vgtm_qp.geometry.pairs import Pair
+from vgtm_qp.geometry.watch import AHEAD, Watch
+from vgtm_qp.native import Code, Program
+from vgtm_qp.qp.answer import Accuracy, StepSolution
+from vgtm_qp.qp.daqp import DAQP
+from vgtm_qp.qp.layout import Layout
+from vgtm_qp.qp.numbers import ClearanceRows
+from vgtm_qp.qp.residual import TOLERANCE
+from vgtm_qp.rows.tip import axes
+from vgtm_qp.step.acceptance import LOOSER, ROUNDING, Acceptance
+from vgtm_qp.step.engine import FusedEngine
+from vgtm_qp.step.separation import Separation
+from vgtm_qp.step.setup import Setup
+from vgtm_qp.step.state import Shortfall, State
+from vgtm_qp.step.target import Target
+
+MOTION_MARGIN = 2.5
+"""Ratio of the displacement for which pairs are listed to the expected displacement of a node."""
+
+TOO_FAR = 1e3
+"""Displacement of a node, over the arm's length, above which a QP's answer shows a singular pose."""
+
+LEAP = 1.0
+"""Greatest displacement of a control vertex's coordinate in one step, over the arm's length."""
+
+DEVIATION = 0.1
+"""Greatest deviation of points from their chords in one step, over the arm's length."""
+
+_ROOM = 64
+"""Capacity at first: rows of clearance."""
+
+_PRESSING = 1e-9
+"""Multiplier above which a row presses, by a solver that only comes near zero."""
+
+
+class Passage(NamedTuple):
+    """A step that was taken: its state, progress and gap, and the QP's answer and rows; see ``Step``."""
+
+    state: State
+    progress: float
+    gap: float
+    solution: StepSolution
+    rows: ClearanceRows
+
+
+def can_drive(setup: Setup) -> bool:
+    """Return whether usual steps of an arm can be taken in one call; then its bodies are spanned by its nodes."""
+    arm, layout = setup.arm, setup.layout
+    is_plain = layout.general is None and layout.own is None and setup.base_motion is None
+    without_limits = setup.minimum_angle == 0.0 and setup.step_limit == np.inf
+    return is_plain and without_limits and len(arm.points(arm.home_configuration)) == len(arm.home)
+
+
+class Driver:
+    """Takes the usual steps of one arm with one engine; the arm :func:`can_drive`.
+
+    Attributes
+    ----------
+    spent : dict of str to float
+        Seconds spent so far in each phase.
+    """
+
+    def __init__(
+        self,
+        setup: Setup,
+        engine: FusedEngine,
+        accuracy: Accuracy,
+        acceptance: Acceptance,
+        separation: Separation,
+    ) -> None:
+        self._setup, self._engine, self._accuracy = setup, engine, accuracy
+        self._acceptance, self._separation = acceptance, separation
+        self._solver, self._layout = engine.solver, engine.layout
+        self._work = self._solver.workspace
+        self._held: State | None = None
+        self._watch: Watch | None = None
+        self.spent = {"distance": 0.0, "qp": 0.0, "acceptance": 0.0}
+        self._started, self._is_placed, self._by_fcl = False, False, 0
+
+    def take(self, state: State, target: Target, share: float) -> Passage | None:
+        """Return the step from `state`, in which no pair is too near, to the end of the target's piece of path.
+
+        The motion of the step before, times `share`, predicts this one. None if the step is no usual one.
+        """
+        setup, work = self._setup, self._work
+        if (
+            not work.is_ready
+            or setup.carrier.carried
+            or not target.path.is_straight(target.start, target.end)
+        ):
+            return None
+        monitor = setup.monitor
+        watch = self._watch = monitor.watching()
+        if watch is None and monitor.has_pairs:
+            return None
+        if not self._started:
+            self._start()
+        program, data = self._program, self._program.data
+        self._load(state, target, share)
+        self._by_fcl = 0
+        if watch is None:
+            data.way = 0
+        else:
+            data.way = watch.started(state.nodes).address
+            watch.refresh()
+        code, has_moved = program.call("take"), False
+        while code in (Code.ASKS, Code.ELSEWHERE, Code.CROWDED):
+            if code is Code.ASKS:
+                self._ask()
+                code = program.call("resume")
+                continue
+            if code is Code.CROWDED:
+                self._make_room(2 * data.room)
+            elif has_moved:
+                break
+            else:
+                assert watch is not None
+                data.way, has_moved = watch.move_to(state.nodes, data.limit, data.self_limit).address, True
+            code = program.call("take")
+        for phase in self.spent:
+            self.spent[phase] += getattr(data, phase)
+            setattr(data, phase, 0.0)
+        return self._passage(state, target) if code is Code.DONE else None
+
+    def _load(self, state: State, target: Target, share: float) -> None:
+        """Write the step's state, goal and boxes."""
+        data, inputs, monitor = self._program.data, self._work.condense.inputs, self._setup.monitor
+        goal = target.goal(0.0).over(target.end - target.start)
+        self._solver.draw(state.control_vertices, target.vertex_goals)
+        self._solver.aim(self._accuracy)
+        inputs[4][:], inputs[5][:] = target.lower, target.upper
+        inputs[8][:], inputs[10][:] = goal.position, goal.velocity
+        inputs[9].reshape(3, 3)[:], inputs[11][:] = goal.rotation.T, goal.spin
+        if state is not self._held:
+            arrays = state.q, state.nodes, state.control_vertices, state.quantities, state.motion
+            for part, values in zip(self._parts, arrays, strict=False):
+                self._before[part] = values.reshape(-1)
+            self._held = state
+        data.duration, data.share = target.duration, share
+        data.safe, data.self_safe = monitor.safe, monitor.self_safe
+
+    def _passage(self, state: State, target: Target) -> Passage | None:
+        """Return the step that the call took; None where what it did not check itself does not hold."""
+        data, work, layout = self._program.data, self._work, self._layout
+        block = self._after.copy()
+        block.setflags(write=False)
+        q, nodes, vertices, values, motion, rates = (block[part] for part in self._parts)
+        q, nodes = q.reshape(work.shape), nodes.reshape(-1, 3)
+        vertices, progress, gap = vertices.reshape(-1, 3), work.data.reached, data.gap
+        shortfall: Shortfall | None = {}
+        if layout.hard_turns:
+            gap = self._setup.gap(q, vertices, state.torsion, None)
+            if layout.hard_tracking and not gap <= self._accuracy.tracking:
+                return None
+        if not data.measures:
+            closed, goal = work.closed(), target.goal(progress)
+            if self._acceptance.flaw(closed, state.q, target, goal, vertices, state.torsion):
+                return None
+        if data.way and not data.proves:
+            shortfall = self._proven(state, q, target)
+            if shortfall is None:
+                return None
+        time, late = state.after(target.duration)
+        then = State(
+            time=time,
+            q=q,
+            nodes=q if self._is_placed else nodes,
+            control_vertices=vertices,
+            torsion=state.torsion,
+            quantities=values,
+            rates=rates,
+            motion=motion.reshape(q.shape),
+            duration=target.duration,
+            shortfall=shortfall,
+            late=late,
+        )
+        self._before[:] = block[: len(self._before)]
+        self._held = then
+        return Passage(
+            then, progress, gap if layout.tracked.size else np.nan, self._solver.answered(), self._rows()
+        )
+
+    def _proven(self, state: State, q: Array, target: Target) -> Shortfall | None:
+        """Return the pairs that are too near at `q`; None if the way there is too long or not proven."""
+        separation, height = self._separation, self._setup.arm.height
+        if not separation.deviation(state.q, q) < DEVIATION * height:
+            return None
+        report, after = separation.proof(state, q, target.time, {})
+        return after if report.certified else None
+
+    def _ask(self) -> None:
+        """Have FCL supply the contacts of the rows that press, where its answers are proven."""
+        began, watch = perf_counter(), self._watch
+        assert watch is not None
+        asked, X = (self._asked[: self._work.data.near] == 1).nonzero()[0], self._nodes
+        for g, pairs in enumerate(watch.groups):
+            rows = asked[self._group[asked] == g]
+            if len(rows):
+                found = self._contacts[rows]
+                numbers, found = pairs.group.contacts(X, 0.0, self._pair[rows], found, True)
+                self._contacts[rows] = found
+                self._by_fcl += int(numbers[:, -1].sum())
+        self.spent["distance"] += perf_counter() - began
+
+    def _rows(self) -> ClearanceRows:
+        """Return the rows of the last QP."""
+        near, work = int(self._work.data.near), self._work
+        if not near or self._watch is None:
+            return ClearanceRows()
+        names, groups = self._setup.monitor.names, [pairs.group for pairs in self._watch.groups]
+        group, pair = self._group[:near].copy(), self._pair[:near].copy()
+
+        def name(k: int) -> str:
+            of, row = groups[group[k]], pair[k]
+            return names.clearance(Pair(int(of.body[row]), int(of.other[row]), of.is_self))
+
+        asks = self._program.data.asks
+        formula = int(np.count_nonzero(self._asked[:near])) - self._by_fcl if asks else near
+        return ClearanceRows(*work.near(near), name, self._by_fcl, formula)
+
+    def _make_room(self, rows: int) -> None:
+        """Make room for that many rows of clearance."""
+        self._work.reserve(rows)
+        self._contacts = np.zeros((rows, CONTACT))
+        self._group, self._pair, self._asked = (np.zeros(rows, dtype=np.int32) for _ in range(3))
+        self._program.set(
+            room=rows, contacts=self._contacts, group=self._group, pair=self._pair, asked=self._asked
+        )
+
+    def _start(self) -> None:
+        """Allocate the arrays of the call, and set what stays the same."""
+        self._started = True
+        setup, layout, arm, work = self._setup, self._layout, self._setup.arm, self._work
+        self._program = program = Program("StepData")
+        sizes = {
+            "q": arm.home_configuration.size,
+            "nodes": arm.home.size,
+            "vertices": 3 * layout.vertices,
+            "values": len(arm.quantity_names),
+            "motion": arm.home_configuration.size,
+            "rates": len(arm.quantity_names),
+        }
+        ends = np.cumsum([0, *sizes.values()]).tolist()
+        self._parts = [slice(first, last) for first, last in pairwise(ends)]
+        self._before, self._after = np.zeros(ends[-2]), np.zeros(ends[-1])
+        for name, part in zip(sizes, self._parts, strict=True):
+            if name != "rates":
+                program.set(**{name: self._before[part]})
+            program.set(**{f"next_{name}": self._after[part]})
+        self._nodes = self._before[self._parts[1]].reshape(-1, 3)
+        self._make_room(_ROOM)
+        placing, straight, levers = arm.placing(), arm.straight_quantities(), arm.travel_levers
+        base, tip = np.flatnonzero(arm.base), arm.end_effector
+        self._is_placed = placing is None
+        if placing is not None:
+            program.set(place=placing)
+        if straight is not None:
+            program.set(first=straight[0].astype(np.int32), last=straight[1].astype(np.int32))
+        if levers is not None:
+            program.set(levers=levers)
+        program.set(
+            fused=work.address,
+            width=arm.home.size,
+            quantities=len(arm.quantity_names),
+            based=len(base),
+            base=base.astype(np.int32),
+            axes=len(axes(layout.tip_rows)),
+            axis=np.array(axes(layout.tip_rows), dtype=np.int32),
+            measures=int(straight is not None and setup.task.turns is None),
+            proves=int(not arm.leaves_chords),
+            actuator=arm.actuators.astype(np.int32),
+            home=arm.home_quantities,
+            tip_nodes=len(tip.nodes),
+            tip_node=tip.nodes.astype(np.int32),
+            tip_weight=np.ascontiguousarray(tip.weights, dtype=float),
+            influence=setup.influence,
+            margin=setup.margin,
+            asks=int(setup.monitor.scene.fcl is not None),
+            pressing=0.0 if self._solver.solver is DAQP else _PRESSING,
+            motion_margin=MOTION_MARGIN,
+            ahead=AHEAD,
+            furthest=TOO_FAR * arm.height,
+            leap=LEAP * arm.height,
+            member=LOOSER * self._accuracy.member,
+            tip=LOOSER * self._accuracy.tip,
+            tracking=self._accuracy.tracking,
+            relative=ROUNDING,
+            tolerance=TOLERANCE,
+            places=np.zeros((2, *arm.home.shape)),
+            **self._separation.pace,
+            **_of_curve(layout),
+        )
+
+
+def _of_curve(layout: Layout) -> dict[str, object]:
+    """Return by field what the C knows of stations and curve."""
+    stations, tracked = layout.arm.stations, layout.tracked
+    if not len(tracked):
+        return {"stations": 0}
+    nodes, weights = stations.nodes[tracked], stations.weights[tracked]
+    return {
+        "stations": len(tracked),
+        "ends_at_tip": int(layout.ends_at_tip),
+        "ends_along_tip": int(layout.ends_along_tip),
+        "must_track": int(layout.hard_tracking and not layout.hard_turns),
+        "station_node": np.ascontiguousarray(nodes, dtype=np.int32),
+        "station_weight": np.ascontiguousarray(weights),
+        "curve_weight": np.ascontiguousarray(layout.curve_weights),
+        "curve_slope": np.ascontiguousarray(layout.curve_slopes[-1]),
+        "end_gain": np.ascontiguousarray(layout.end_gain),
+        "normal": np.ascontiguousarray(stations.frames[0][:, 2]),
+    }
