@@ -48,9 +48,9 @@ typedef struct {
     double tolerance;                      /* of the QP's residuals */
 
     /* The state, and the next one: q, nodes, (V, 3) control vertices, quantities, the last motion of q; of the next also
-       the rates of the quantities over the duration. */
+       the rates of the quantities over the duration, and the tip's position and rotation (3, 3), row by row. */
     double *q, *nodes, *vertices, *values, *motion;
-    double *next_q, *next_nodes, *next_vertices, *next_values, *next_motion, *next_rates;
+    double *next_q, *next_nodes, *next_vertices, *next_values, *next_motion, *next_rates, *next_tip;
     double duration;
     double *places;                        /* (2, N, 3) */
 
@@ -271,6 +271,9 @@ static int arrive(StepData *s)
     if (s->must_track && !(s->gap <= s->tracking)) return OFF_CURVE;
     for (int i = 0; i < f->coordinates; i++) s->next_motion[i] = s->next_q[i] - s->q[i];
     for (int m = 0; m < s->quantities; m++) s->next_rates[m] = (s->next_values[m] - s->values[m]) / s->duration;
+    memcpy(s->next_tip, f->missing.res[1], sizeof(double) * 3);
+    for (int a = 0; a < 3; a++)
+        for (int b = 0; b < 3; b++) s->next_tip[3 + 3 * a + b] = f->missing.res[2][3 * b + a];
     if (!w || !s->proves) return DONE;
     memcpy(s->places, s->nodes, sizeof(double) * s->width);
     memcpy(s->places + s->width, s->next_nodes, sizeof(double) * s->width);

@@ -29,7 +29,7 @@ def actuator_box(
     speed: Array,
     stroke: Array,
     rate: Array,
-    acceleration: Array,
+    acceleration: Array | None,
     dt: float,
     last_dt: float | None = None,
 ) -> tuple[Array, Array]:
@@ -44,13 +44,16 @@ def actuator_box(
     ----------
     speed : (n_a,)
         Mean speed over the step before, per second.
+    acceleration
+        Limits; None without any.
     last_dt
         Duration of that step, s; `dt` by default. An acceleration is a change of mean speed over the time between
         the middles of two steps.
     """
     low, high = np.minimum(stroke[:, 0], value), np.maximum(stroke[:, 1], value)
-    if np.isinf(acceleration).all():
-        return np.maximum(low, value - rate * dt), np.minimum(high, value + rate * dt)
+    if acceleration is None:
+        travel = rate * dt
+        return np.maximum(low, value - travel), np.minimum(high, value + travel)
     interval = dt if last_dt is None else 0.5 * (dt + last_dt)
     fastest = np.minimum(rate, braking_speed(high - value, acceleration, dt))
     slowest = -np.minimum(rate, braking_speed(value - low, acceleration, dt))

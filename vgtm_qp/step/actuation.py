@@ -101,6 +101,7 @@ class Actuation:
         self._settled = enough_length(arm.home_configuration, self.tolerance)
         self._slows_down = setup.slows_down and self.starts_at_once
         self._least_approach = _LEAST_APPROACH * arm.unit / arm.levers
+        self._pace: tuple[float, Array] = 0.0, self._rate
         self.locked: set[str] = set()
         self._held = np.zeros(len(self.names), dtype=bool)
         self._jams = sorted(setup.jams, key=lambda jam: -jam[1])
@@ -151,17 +152,17 @@ class Actuation:
 
         With `slowing`, actuators slow down before the ends of their strokes, if the problem asks for it.
         """
-        value, rates, stroke = self.values(state), state.rates.take(self._actuators), self._stroke
-        # The error that settling may leave, over the duration, is a rate. In a very short step less is left.
-        spare = np.minimum(self.tolerance / dt, _SPARE_RATE * self._rate)
-        rate = np.maximum(self._rate - np.maximum(spare, self._settled / dt), 0.0)
-        ends = stroke, rate, self._acceleration
-        lower, upper = actuator_box(value, rates, *ends, dt, state.duration or None)
+        value, stroke, rate = self.values(state), self._stroke, self._paced(dt)
+        limited = None if self.starts_at_once else self._acceleration
+        speed = state.rates.take(self._actuators)
+        lower, upper = actuator_box(value, speed, stroke, rate, limited, dt, state.duration or None)
         if slowing and self._slows_down:
-            down, up = self._approach(value - stroke[:, 0]), self._approach(stroke[:, 1] - value)
+            # To the lower ends of the strokes, and to the upper ends.
+            left = np.maximum([value - stroke[:, 0], stroke[:, 1] - value], 0.0)
+            down, up = np.maximum(_APPROACH * left, np.minimum(left, self._least_approach))
             slow_lower, slow_upper = np.minimum(value - down, upper), np.maximum(value + up, lower)
             lower, upper = np.maximum(lower, slow_lower), np.minimum(upper, slow_upper)
-        return Limits(lower, upper, self.names, value, rate * dt, *ends[::2], self._held)
+        return Limits(lower, upper, self.names, value, rate * dt, stroke, self._acceleration, self._held)
 
     def creeping(self, state: State, box: Box, dt: float) -> Box | None:
         """Return the part of a box from which every actuator can stop at once; None if there is none."""
@@ -169,7 +170,11 @@ class Actuation:
         lower, upper = np.maximum(box[0], value - reach), np.minimum(box[1], value + reach)
         return (lower, upper) if np.all(lower <= upper) else None
 
-    def _approach(self, distance: Array) -> Array:
-        """Return the greatest approach of a slowing actuator at `distance` (n_a,) from its end, m or rad."""
-        distance = np.maximum(distance, 0.0)
-        return np.asarray(np.maximum(_APPROACH * distance, np.minimum(distance, self._least_approach)))
+    def _paced(self, dt: float) -> Array:
+        """Return (n_a,) the greatest rates of a step of `dt`, s, less what settling may add."""
+        if dt != self._pace[0]:
+            # The error that settling may leave, over the duration, is a rate. In a very short step less is left.
+            spare = np.minimum(self.tolerance / dt, _SPARE_RATE * self._rate)
+            rate = np.maximum(self._rate - np.maximum(spare, self._settled / dt), 0.0)
+            self._pace = dt, rate
+        return self._pace[1]

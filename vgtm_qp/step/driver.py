@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from vgtm_qp.arm.arm import Pose
 from vgtm_qp.arrays import Array
 from vgtm_qp.geometry.exact import CONTACT
 from vgtm_qp.geometry.pairs import Pair
@@ -161,7 +162,7 @@ class Driver:
         data, work, layout = self._program.data, self._work, self._layout
         block = self._after.copy()
         block.setflags(write=False)
-        q, nodes, vertices, values, motion, rates = (block[part] for part in self._parts)
+        q, nodes, vertices, values, motion, rates, tip = (block[part] for part in self._parts)
         q, nodes = q.reshape(work.shape), nodes.reshape(-1, 3)
         vertices, progress, gap = vertices.reshape(-1, 3), work.data.reached, data.gap
         shortfall: Shortfall | None = {}
@@ -190,6 +191,7 @@ class Driver:
             duration=target.duration,
             shortfall=shortfall,
             late=late,
+            tip=Pose(tip[:3], tip[3:].reshape(3, 3)),
         )
         self._before[:] = block[: len(self._before)]
         self._held = then
@@ -256,12 +258,13 @@ class Driver:
             "values": len(arm.quantity_names),
             "motion": arm.home_configuration.size,
             "rates": len(arm.quantity_names),
+            "tip": 12,
         }
         ends = np.cumsum([0, *sizes.values()]).tolist()
         self._parts = [slice(first, last) for first, last in pairwise(ends)]
-        self._before, self._after = np.zeros(ends[-2]), np.zeros(ends[-1])
+        self._before, self._after = np.zeros(ends[5]), np.zeros(ends[-1])
         for name, part in zip(sizes, self._parts, strict=True):
-            if name != "rates":
+            if part.stop <= len(self._before):
                 program.set(**{name: self._before[part]})
             program.set(**{f"next_{name}": self._after[part]})
         self._nodes = self._before[self._parts[1]].reshape(-1, 3)

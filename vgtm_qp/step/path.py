@@ -16,6 +16,10 @@ from vgtm_qp.errors import GoalError
 from vgtm_qp.rotation import rotation_from_vector, vector_from_rotation
 from vgtm_qp.rows.tip import TipGoal
 
+_NOT_FINITE = "a goal must be made of finite numbers; the state of the arm is unchanged"
+
+_UNIT, _AT_REST = np.array([0.0, 1.0]), np.zeros((1, 3))
+
 
 @dataclass(frozen=True, eq=False)
 class Path:
@@ -41,7 +45,7 @@ class Path:
         knots, positions, rotations = self.knots, self.positions, self.rotations
         # One entry that is not finite makes the sum not finite.
         if not math.isfinite(knots.sum() + positions.sum() + rotations.sum()):
-            raise GoalError("a goal must be made of finite numbers; the state of the arm is unchanged")
+            raise GoalError(_NOT_FINITE)
         widths = (knots[1:] - knots[:-1])[:, None]
         if not (widths > 0.0).all():
             raise GoalError("the times of a path must increase strictly")
@@ -54,6 +58,32 @@ class Path:
         object.__setattr__(self, "_turned", turned)
         object.__setattr__(self, "_velocity", (positions[1:] - positions[:-1]) / widths)
         object.__setattr__(self, "_spin", spin)
+
+    @classmethod
+    def straight(cls, position: Array, rotation: Array, to: Array, turned: Array) -> Path:
+        """Return the path from 0 to 1 from a pose, (3,) and (3, 3), to another.
+
+        Raises
+        ------
+        GoalError
+            A number of a position is not finite.
+        """
+        if turned is not rotation:
+            return cls(np.array([0.0, 1.0]), np.array([position, to]), np.array([rotation, turned]))
+        # A control loop makes one for each step, so the general way would cost as much as the step's rows.
+        path, velocity = object.__new__(cls), to - position
+        if not math.isfinite(sum(velocity.tolist())):
+            raise GoalError(_NOT_FINITE)
+        path.__dict__.update(
+            knots=_UNIT,
+            positions=np.array([position, to]),
+            rotations=np.array([rotation, rotation]),
+            _knots=[0.0, 1.0],
+            _turned=[False],
+            _velocity=velocity[None],
+            _spin=_AT_REST,
+        )
+        return path
 
     @property
     def start(self) -> float:

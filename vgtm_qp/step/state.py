@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from vgtm_qp.arm.arm import Arm
+from vgtm_qp.arm.arm import Arm, Pose
 from vgtm_qp.arrays import Array
 from vgtm_qp.geometry.clearance import Pair
 from vgtm_qp.qp.answer import Closed
@@ -55,6 +55,8 @@ class State:
         Duration of that step, s; 0 at home, where the arm rests.
     shortfall : Shortfall or None
         Pairs below their clearance; None if not computed yet.
+    tip : Pose or None
+        Pose of the end effector; None if not computed yet.
     late : float
         Duration that `time` lacks by rounding, s. A large clock cannot show a short step, but the sum of
         many.
@@ -71,6 +73,7 @@ class State:
     torsion: Array = field(default_factory=lambda: frozen(np.zeros(0)))
     shortfall: Shortfall | None = None
     late: float = 0.0
+    tip: Pose | None = None
 
     def after(self, duration: float) -> tuple[float, float]:
         """Return `time` and `late` after a step of a `duration`, s."""
@@ -94,4 +97,5 @@ class State:
             duration=duration,
             shortfall=shortfall,
             late=late,
+            tip=Pose(_sealed(closed.tip_position), _sealed(closed.tip_rotation)),
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import StrEnum
 from functools import cached_property
 
@@ -16,6 +16,9 @@ from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.qp.residual import FailedStepError
 from vgtm_qp.step.actuation import Limits
 from vgtm_qp.step.state import State
+
+_OVER = "status", "progress", "limits", "multipliers"
+"""What is another of a step over a longer piece of path."""
 
 WHOLE = 1.0 - 1e-9
 """Progress from which a goal counts as reached."""
@@ -107,7 +110,8 @@ class Step:
         status, progress = self.status, share * self.progress
         if self.moved:
             status = StepStatus.REACHED if progress >= WHOLE else StepStatus.SLOWED
-        return replace(self, status=status, progress=progress, limits=limits)
+        fields = {key: value for key, value in vars(self).items() if key not in _OVER}
+        return Step(**fields, status=status, progress=progress, limits=limits)
 
     @property
     def moved(self) -> bool:

@@ -127,7 +127,7 @@ class TipTask:
             turned = rotation_from_vector(turn_between(rotation[:, 2], wanted / norm)) @ rotation
         elif rotation_vector is not None:
             turned = rotation_from_vector(vector(rotation_vector, "rotation_vector"))
-        return Path(np.array([0.0, 1.0]), np.stack([here, there]), np.stack([rotation, turned]))
+        return Path.straight(here, rotation, there, turned)
 
 
 def over_all_nodes(arm: Arm, response: Array) -> Array:
@@ -161,6 +161,6 @@ def vector(value: ArrayLike, name: str) -> Array:
         numbers = np.asarray(value, dtype=float)
     except (TypeError, ValueError):
         numbers = np.zeros(0)
-    if numbers.shape != (3,) or not np.all(np.isfinite(numbers)):
+    if numbers.shape != (3,) or not all(map(math.isfinite, numbers.tolist())):
         raise GoalError(f"{name} must be three finite numbers, not {value!r}; {_UNCHANGED}")
     return numbers
