@@ -174,14 +174,21 @@ LIES = (
 
 def lie_always(monkeypatch, lie, monitor=None, X=None):
     """Have every answer of FCL be a lie."""
-    truth = FclQueries.answers
+    truth, one = FclQueries.answers, FclQueries.answer
 
     def answers(self, *asked):
         found = truth(self, *asked)
         lie(found, monitor, X)
         return found
 
+    def answer(self, question, piece, written):
+        one(self, question, piece, written)
+        found = written[None] / self.scale
+        lie(found, monitor, X)
+        written[:] = self.scale * found[0]
+
     monkeypatch.setattr(FclQueries, "answers", answers)
+    monkeypatch.setattr(FclQueries, "answer", answer)
 
 
 @pytest.mark.parametrize("lie", LIES)
@@ -344,7 +351,8 @@ def test_between_cylinders_the_states_are_those_of_closed_forms_to_what_fcl_leav
     np.testing.assert_allclose(found[0].nodes, found[1].nodes, atol=1e-4)
 
 
-def test_every_row_that_presses_is_proven_and_lies_change_no_step(problem, monkeypatch):
+@pytest.mark.parametrize("untruth", [too_far, too_near, not_a_number, infinite])
+def test_every_row_that_presses_is_proven_and_lies_change_no_step(untruth, problem, monkeypatch):
     pressed = 0
     goal = np.array([0.9, 0.0, 3.6])
     honest, lied, exact = (
@@ -360,7 +368,7 @@ def test_every_row_that_presses_is_proven_and_lies_change_no_step(problem, monke
         other = exact.step(position=goal)
         assert (other.fcl_rows, other.exact_rows) == (0, len(other.rows))
         with lie() as patched:
-            lie_always(patched, too_far)
+            lie_always(patched, untruth)
             third = lied.step(position=goal)
         assert third.fcl_rows == 0
         assert np.count_nonzero(third.solution.clearance_multipliers) <= third.exact_rows <= len(third.rows)

@@ -55,12 +55,14 @@ class FclQueries:
     ----------
     asked, refused : int
         Queries so far, and those whose answer was not proven.
+    scale : float
+        FCL's units in a metre.
     """
 
     def __init__(self, pieces: ObstaclePieces, bodies: Bodies, unit: float = 1.0) -> None:
         self.asked = self.refused = 0
-        self._pieces, self._scale = pieces, _UNITS / unit
-        self._hulls = [None if hull is None else _hull(hull, self._scale) for hull in bodies.hulls]
+        self._pieces, self.scale = pieces, _UNITS / unit
+        self._hulls = [None if hull is None else _hull(hull, self.scale) for hull in bodies.hulls]
         # Of each hull the mean of the corners of its simplex, m, and the inverse of its edges.
         self._corners, self._inverse = np.zeros((len(bodies.hulls), 3)), np.zeros((len(bodies.hulls), 3, 3))
         for k, hull in enumerate(bodies.hulls):
@@ -85,13 +87,31 @@ class FclQueries:
         time : float
             s; the pieces are where they are at that time.
         """
-        ends = self._scale * pairs[:, :12]
+        ends = self.scale * pairs[:, :12]
         bodies = map(self._body.placed, *_axes(ends[:, :3], ends[:, 3:6]))
         if pieces is None:
             others = map(self._other.placed, *_axes(ends[:, 6:9], ends[:, 9:]))
         else:
             others = map(self._piece, pieces, repeat(time))
         return self._ask(bodies, others)
+
+    def answer(self, question: Array, piece: int | None, answer: Array) -> None:
+        """Write FCL's distance and nearest points (7) of one pair, all in FCL's units, to `answer`.
+
+        The `question` (12) has middle and span of the body's axis, then those of the other body's, which only count
+        where `piece` is None. Pieces are at rest.
+        """
+        body = self._body.placed(question[:3], question[3:6].tolist())
+        other = (
+            self._other.placed(question[6:9], question[9:].tolist())
+            if piece is None
+            else self._piece(piece, 0.0)
+        )
+        # A value that FCL does not overwrite must not pass for an answer.
+        self._result.min_distance = inf
+        answer[0] = fcl.distance(body, other, self._request, self._result)
+        answer[1:4], answer[4:] = self._result.nearest_points
+        self.asked += 1
 
     def answers_of_hulls(
         self, body: Sequence[int], points: Array, other: Sequence[int], of_other: Array, *, is_self: bool
@@ -122,7 +142,7 @@ class FclQueries:
             found += here.tolist()
             found += there.tolist()
         self.asked += len(found) // 7
-        return np.array(found).reshape(-1, 7) / self._scale
+        return np.array(found).reshape(-1, 7) / self.scale
 
     def _poses(self, bodies: Sequence[int], points: Array) -> list[Array]:
         """Return for each body the rotation and the position (3, 4) of its hull for `points` (K, 4, 3), m."""
@@ -131,14 +151,14 @@ class FclQueries:
         # Between two states points go straight, so that their frame is a rotation only nearly.
         u, _, v = np.linalg.svd(edges @ inverse)
         turn = u @ v
-        position = self._scale * (points.mean(axis=1)[..., None] - turn @ corners)
+        position = self.scale * (points.mean(axis=1)[..., None] - turn @ corners)
         return list(np.concatenate([turn, position], axis=2))
 
     def _placed(self, axis: _Axis, body: int, points: Array, pose: Array) -> fcl.CollisionObject:
         """Return the object of a body: its hull at `pose` (3, 4), or `axis` for a capsule at `points` (4, 3), m."""
         known = self._hulls[body]
         if known is None:
-            first, second = self._scale * points[:2]
+            first, second = self.scale * points[:2]
             return axis.placed(0.5 * (first + second), (second - first).tolist())
         known.setTransform(fcl.Transform(pose[:, :3], pose[:, 3]))
         return known
@@ -148,7 +168,7 @@ class FclQueries:
         known = self._piece(piece, 0.0)
         if self._pieces.moving:
             own = self._pieces.parameters[piece] if self._pieces.shape[piece] == "triangle" else np.zeros(3)
-            known.setTranslation(self._scale * (row[:3] - own[:3]))
+            known.setTranslation(self.scale * (row[:3] - own[:3]))
         return known
 
     def _piece(self, piece: int, time: float) -> fcl.CollisionObject:
@@ -156,12 +176,12 @@ class FclQueries:
         known = self._objects.get(piece)
         if known is None:
             shape, row = self._pieces.shape[piece], self._pieces.parameters[piece]
-            known = self._objects[piece] = _object(shape, row, self._scale)
+            known = self._objects[piece] = _object(shape, row, self.scale)
         if self._pieces.moving:
             at = time * self._pieces.velocity[piece]
             if self._pieces.shape[piece] != "triangle":
                 at += self._pieces.center[piece]
-            known.setTranslation(self._scale * at)
+            known.setTranslation(self.scale * at)
         return known
 
 

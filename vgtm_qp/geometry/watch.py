@@ -19,7 +19,7 @@ from vgtm_qp.arrays import Array
 from vgtm_qp.compiled import Compiling, Kernel, compiler
 from vgtm_qp.errors import EvaluationError
 from vgtm_qp.geometry.candidates import every_pair, every_pair_with_pieces
-from vgtm_qp.geometry.exact import CONTACT, WIDTH, follow_function
+from vgtm_qp.geometry.exact import CONTACT, WIDTH, follow_function, proof_function
 from vgtm_qp.geometry.formulas import FURTHEST
 from vgtm_qp.geometry.groups import Found, Group, Scene
 from vgtm_qp.geometry.pairs import Contacts, Wanted
@@ -51,6 +51,13 @@ def _contact(shape: str, _: str | None) -> tuple[ca.Function, Compiling]:
     return function, Compiling(function)
 
 
+@cache
+def _proof(shape: str, _: str | None) -> tuple[ca.Function, Compiling]:
+    """Return the function that proves an answer of FCL, and its compilation, once for each compiler."""
+    function = proof_function(shape)
+    return function, Compiling(function)
+
+
 def is_ready(shapes: Iterable[str]) -> bool:
     """Whether scenes of these shapes can be watched; always false if nothing can be compiled."""
     library = building()
@@ -75,6 +82,11 @@ class WatchedGroup:
             pair=contact.inputs[1],
             found=contact.outputs[0],
         )
+        if group.scene.fcl is not None:
+            function, compiling = _proof(group.shape, compiler())
+            proof = Kernel(function, compiled=compiling)
+            pair, answer = proof.inputs
+            self._program.set(proof=proof, proof_pair=pair, answer=answer, proven=proof.outputs[0])
         self.data = self._program.data
         self.hold(group)
 

@@ -28,6 +28,10 @@ typedef struct {
     double *ends, *pair;
     const double *found;
 
+    Kernel proof;                        /* (pair, answer 7) -> contact 9, its last number the flaw; or no eval */
+    double *proof_pair, *answer;
+    const double *proven;
+
     int near, is_close, overlaps;
     double lowest;                       /* least lower bound over the motion of the evaluated pairs */
     Index *rows;                         /* (C): the evaluated pairs */
@@ -82,6 +86,50 @@ static int contact(Pairs *p, int k, const double *before, const double *after)
     if (call(&p->contact)) return NO_VALUE;
     memcpy(p->known + KNOWN * k + KNOWN_NORMAL, p->found + NORMAL, 3 * sizeof(double));
     return DONE;
+}
+
+/* The two ends of the body's axis (6) of pair k at `place`, for its `contact`: the nearest point twice where another
+   contact has the other one. */
+static void ends_for(const Pairs *p, int k, const double *place, const double *contact, double *ends)
+{
+    const double *a = place + 3 * p->points[4 * k], *b = place + 3 * p->points[4 * k + 1];
+    double t = contact[2];
+    int is_only = contact[CONTACT - 1] != 0.0;
+    for (int i = 0; i < 3; i++) {
+        double point = (1.0 - t) * a[i] + t * b[i];
+        ends[i] = is_only ? a[i] : point;
+        ends[3 + i] = is_only ? b[i] : point;
+    }
+}
+
+/* Middle and span (6) of the axis between two ends (6), times `scale`. */
+static void axis_of(const double *ends, double scale, double *axis)
+{
+    for (int i = 0; i < 3; i++) {
+        axis[i] = scale * 0.5 * (ends[i] + ends[3 + i]);
+        axis[3 + i] = scale * (ends[3 + i] - ends[i]);
+    }
+}
+
+/* Replace the `contact` of pair k by an answer (7) about it, if that is proven: its flaw is no greater than `flaw`, and
+   the axes are further apart than `apart`. Return whether it is. */
+static int prove(Pairs *p, int k, const double *place, const double *answer, double flaw, double apart, double *contact)
+{
+    const double *known = p->known + KNOWN * k;
+    double *pair = p->proof_pair, *radius = pair + (p->is_self ? 12 : KNOWN_NORMAL - 1 + 6);
+    ends_for(p, k, place, contact, pair);
+    if (p->is_self)
+        for (int i = 0; i < 2; i++) memcpy(pair + 6 + 3 * i, place + 3 * p->points[4 * k + 2 + i], 3 * sizeof(double));
+    else memcpy(pair + 6, known, (KNOWN_NORMAL - 1) * sizeof(double));
+    *radius = known[KNOWN_NORMAL - 1];
+    memcpy(p->answer, answer, 7 * sizeof(double));
+    if (call(&p->proof)) return 0;
+    /* NaN fails the comparisons. */
+    if (!(p->proven[CONTACT - 1] <= flaw && p->proven[0] + *radius > apart)) return 0;
+    double weights[2] = {contact[1], contact[2]};
+    memcpy(contact, p->proven, (CONTACT - 1) * sizeof(double));
+    if (contact[CONTACT - 1] == 0.0) memcpy(contact + 1, weights, sizeof(weights));
+    return 1;
 }
 
 /* Lower the bounds by what the bodies moved, and evaluate the pairs that may be nearer than the limit. If

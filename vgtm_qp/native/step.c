@@ -37,8 +37,10 @@ typedef struct {
     /* Clearances, the margin of their rows, the distance of pairs that are far, share and least of a pair's approach;
        rounding of a distance. */
     double safe, self_safe, margin, influence, share_of_way, least_way, rounding;
-    int asks;                              /* whether another program supplies the contacts that may press */
-    double pressing;                       /* multiplier above which a row does */
+    /* Whether another program supplies the contacts of rows that press: with multipliers above this. Its unit of length
+       per m; the greatest flaw of a proven answer, and the least distance of axes that have one, m. */
+    int asks;
+    double pressing, scale, flaw, apart;
     /* Ratio of the displacement for which pairs are listed to the expected one; share of the last motion expected;
        and that of the limits of pairs that the next step may have. */
     double motion_margin, share, ahead;
@@ -54,9 +56,11 @@ typedef struct {
     double duration;
     double *places;                        /* (2, N, 3) */
 
-    /* Rows of clearance: their contacts (R, 9), numbers of group and pair, and whether they were asked for. */
-    int room, asking;
-    double *contacts;
+    /* Rows of clearance: their contacts (R, 9), numbers of group and pair, and in which round they were asked for, 0 in
+       none; middle and span of the body and of the other body (R, 12), and the answer (R, 7): a distance, a point of the
+       body and one of the other. Counts of rounds, of rows asked for, and of answers that were proven. */
+    int room, round, asked_for, proven;
+    double *contacts, *questions, *answers;
     int *group, *pair, *asked;
 
     double limit, self_limit, gap;
@@ -98,7 +102,7 @@ static int list_rows(StepData *s)
     Way *w = s->way;
     int count = 0;
     s->fused->slots = 4;
-    s->fused->near = 0;
+    s->fused->near = s->round = s->asked_for = s->proven = 0;
     if (!w) return DONE;
     if (!(s->limit <= w->reach && s->self_limit <= w->self_reach)
         || memcmp(w->place, s->nodes, sizeof(double) * s->width))
@@ -150,18 +154,42 @@ static void look_ahead(StepData *s)
     s->self_limit = fmin(s->influence, s->self_safe + 2.0 * reach);
 }
 
-/* Mark the rows that press and whose contacts nobody was asked for yet. */
+/* Ask for the contacts of the rows that press, but for those that were asked for before; return whether there are any. */
 static int who_presses(StepData *s)
 {
     Fused *f = s->fused;
     const double *multiplier = f->multipliers + f->unknowns + f->tips + f->hard + f->legs;
-    s->asking = 0;
-    for (int k = 0; k < f->near; k++)
-        if (!s->asked[k] && fabs(multiplier[k]) > s->pressing) {
-            s->asked[k] = 1;
-            s->asking++;
-        } else if (s->asked[k]) s->asked[k] = 2;
-    return s->asking;
+    int before = s->asked_for;
+    s->round++;
+    for (int k = 0; k < f->near; k++) {
+        if (s->asked[k] || !(fabs(multiplier[k]) > s->pressing)) continue;
+        const Pairs *p = s->way->group[s->group[k]];
+        double ends[6];
+        ends_for(p, s->pair[k], s->nodes, s->contacts + CONTACT * k, ends);
+        axis_of(ends, s->scale, s->questions + 12 * k);
+        if (p->is_self) {
+            for (int i = 0; i < 2; i++)
+                memcpy(ends + 3 * i, s->nodes + 3 * p->points[4 * s->pair[k] + 2 + i], 3 * sizeof(double));
+            axis_of(ends, s->scale, s->questions + 12 * k + 6);
+        }
+        s->asked[k] = s->round;
+        s->asked_for++;
+    }
+    return s->asked_for > before;
+}
+
+/* Use the answers of this round that are proven. */
+static void use_answers(StepData *s)
+{
+    for (int k = 0; k < s->fused->near; k++) {
+        if (s->asked[k] != s->round) continue;
+        double answer[7];
+        for (int i = 0; i < 7; i++) answer[i] = s->answers[7 * k + i] / s->scale;
+        Pairs *p = s->way->group[s->group[k]];
+        if (!prove(p, s->pair[k], s->nodes, answer, s->flaw, s->apart, s->contacts + CONTACT * k)) continue;
+        s->proven++;
+        clearance_row(s, k);
+    }
 }
 
 /* Whether the state that was settled keeps its quantities, its limits and its goal, measured anew by plain arithmetic. */
@@ -319,7 +347,7 @@ EXPORT int take(StepData *s)
 EXPORT int resume(StepData *s)
 {
     double mark = now();
-    for (int k = 0; k < s->fused->near; k++)
-        if (s->asked[k] == 1) clearance_row(s, k);
+    use_answers(s);
+    spend(&s->distance, &mark);
     return proceed(s, &mark);
 }

@@ -15,7 +15,7 @@ import numpy as np
 
 from vgtm_qp.arm.arm import Pose
 from vgtm_qp.arrays import Array
-from vgtm_qp.geometry.exact import CONTACT
+from vgtm_qp.geometry.exact import CONTACT, NORMAL_FROM, PROOF
 from vgtm_qp.geometry.pairs import Pair
 from vgtm_qp.geometry.watch import AHEAD, Watch
 from vgtm_qp.native import Code, Program
@@ -93,7 +93,7 @@ class Driver:
         self._held: State | None = None
         self._watch: Watch | None = None
         self.spent = {"distance": 0.0, "qp": 0.0, "acceptance": 0.0}
-        self._started, self._is_placed, self._by_fcl = False, False, 0
+        self._started = self._is_placed = False
 
     def take(self, state: State, target: Target, share: float) -> Passage | None:
         """Return the step from `state`, in which no pair is too near, to the end of the target's piece of path.
@@ -115,7 +115,6 @@ class Driver:
             self._start()
         program, data = self._program, self._program.data
         self._load(state, target, share)
-        self._by_fcl = 0
         if watch is None:
             data.way = 0
         else:
@@ -135,6 +134,9 @@ class Driver:
                 assert watch is not None
                 data.way, has_moved = watch.move_to(state.nodes, data.limit, data.self_limit).address, True
             code = program.call("take")
+        if data.asked_for:
+            assert monitor.scene.fcl is not None
+            monitor.scene.fcl.refused += data.asked_for - data.proven
         for phase in self.spent:
             self.spent[phase] += getattr(data, phase)
             setattr(data, phase, 0.0)
@@ -208,17 +210,14 @@ class Driver:
         return after if report.certified else None
 
     def _ask(self) -> None:
-        """Have FCL supply the contacts of the rows that press, where its answers are proven."""
-        began, watch = perf_counter(), self._watch
+        """Have FCL answer the questions of this round."""
+        began, watch, fcl = perf_counter(), self._watch, self._setup.monitor.scene.fcl
         assert watch is not None
-        asked, X = (self._asked[: self._work.data.near] == 1).nonzero()[0], self._nodes
-        for g, pairs in enumerate(watch.groups):
-            rows = asked[self._group[asked] == g]
-            if len(rows):
-                found = self._contacts[rows]
-                numbers, found = pairs.group.contacts(X, 0.0, self._pair[rows], found, True)
-                self._contacts[rows] = found
-                self._by_fcl += int(numbers[:, -1].sum())
+        assert fcl is not None
+        for k in (self._asked == self._program.data.round).nonzero()[0].tolist():
+            group = watch.groups[self._group[k]].group
+            piece = None if group.is_self else int(group.other[self._pair[k]])
+            fcl.answer(self._questions[k], piece, self._answers[k])
         self.spent["distance"] += perf_counter() - began
 
     def _rows(self) -> ClearanceRows:
@@ -233,17 +232,37 @@ class Driver:
             of, row = groups[group[k]], pair[k]
             return names.clearance(Pair(int(of.body[row]), int(of.other[row]), of.is_self))
 
-        asks = self._program.data.asks
-        formula = int(np.count_nonzero(self._asked[:near])) - self._by_fcl if asks else near
-        return ClearanceRows(*work.near(near), name, self._by_fcl, formula)
+        data = self._program.data
+        return ClearanceRows(
+            *work.near(near), name, data.proven, (data.asked_for if data.asks else near) - data.proven
+        )
+
+    def _of_fcl(self) -> dict[str, float]:
+        """Return by field what the C knows of FCL."""
+        scene = self._setup.monitor.scene
+        if scene.fcl is None:
+            return {"asks": 0}
+        return {
+            "asks": 1,
+            "pressing": 0.0 if self._solver.solver is DAQP else _PRESSING,
+            "scale": scene.fcl.scale,
+            "flaw": PROOF * scene.unit,
+            "apart": NORMAL_FROM * scene.unit,
+        }
 
     def _make_room(self, rows: int) -> None:
         """Make room for that many rows of clearance."""
         self._work.reserve(rows)
-        self._contacts = np.zeros((rows, CONTACT))
+        self._contacts, self._questions, self._answers = (np.zeros((rows, n)) for n in (CONTACT, 12, 7))
         self._group, self._pair, self._asked = (np.zeros(rows, dtype=np.int32) for _ in range(3))
         self._program.set(
-            room=rows, contacts=self._contacts, group=self._group, pair=self._pair, asked=self._asked
+            room=rows,
+            contacts=self._contacts,
+            questions=self._questions,
+            answers=self._answers,
+            group=self._group,
+            pair=self._pair,
+            asked=self._asked,
         )
 
     def _start(self) -> None:
@@ -295,8 +314,7 @@ class Driver:
             tip_weight=np.ascontiguousarray(tip.weights, dtype=float),
             influence=setup.influence,
             margin=setup.margin,
-            asks=int(setup.monitor.scene.fcl is not None),
-            pressing=0.0 if self._solver.solver is DAQP else _PRESSING,
+            **self._of_fcl(),
             motion_margin=MOTION_MARGIN,
             ahead=AHEAD,
             furthest=TOO_FAR * arm.height,
