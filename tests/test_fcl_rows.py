@@ -351,7 +351,7 @@ def test_between_cylinders_the_states_are_those_of_closed_forms_to_what_fcl_leav
     np.testing.assert_allclose(found[0].nodes, found[1].nodes, atol=1e-4)
 
 
-@pytest.mark.parametrize("untruth", [too_far, too_near, not_a_number, infinite])
+@pytest.mark.parametrize("untruth", [lie for lie in LIES if lie not in (other_pair, not_the_nearest)])
 def test_every_row_that_presses_is_proven_and_lies_change_no_step(untruth, problem, monkeypatch):
     pressed = 0
     goal = np.array([0.9, 0.0, 3.6])

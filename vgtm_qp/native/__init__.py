@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import ctypes
 import re
+from collections.abc import Callable
 from enum import IntEnum
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -140,6 +141,12 @@ class Program:
         """Use the kernels that were compiled meanwhile."""
         if self._interpreted:
             self.set(**{key: kernel for key, kernel in self._interpreted.items() if kernel.is_done})
+
+    def entry(self, name: str) -> Callable[[], int]:
+        """Return the C function of that name, called with the structure alone: for calls in which every us counts."""
+        function = self._library[name]
+        function.argtypes = (ctypes.c_void_p,)
+        return partial(function, self.address)
 
     def call(self, name: str, *arguments: float) -> Code:
         """Call the C function of that name with the structure and numbers; kernels compiled meanwhile are used."""

@@ -64,8 +64,10 @@ typedef struct {
     int *group, *pair, *asked;
 
     double limit, self_limit, gap;
-    double distance, qp, acceptance;       /* s spent in each phase so far */
+    double *spent;                         /* (3) s in each phase so far: distance, QP, acceptance */
 } StepData;
+
+enum { DISTANCE, QP, ACCEPTANCE };
 
 static double now(void)
 {
@@ -318,10 +320,10 @@ static int proceed(StepData *s, double *mark)
     int code = answer(s->fused);
     if (!code && s->asks && who_presses(s)) code = ASKS;
     else if (!code) code = depart(s->fused, s->tolerance);
-    spend(&s->qp, mark);
+    spend(&s->spent[QP], mark);
     if (code) return code;
     code = arrive(s);
-    spend(&s->acceptance, mark);
+    spend(&s->spent[ACCEPTANCE], mark);
     return code;
 }
 
@@ -331,7 +333,7 @@ EXPORT int take(StepData *s)
     double mark = now();
     look_ahead(s);
     int code = list_rows(s);
-    spend(&s->distance, &mark);
+    spend(&s->spent[DISTANCE], &mark);
     if (code) return code;
     if (s->way) {
         s->way->wanted = s->ahead * s->limit;
@@ -339,7 +341,7 @@ EXPORT int take(StepData *s)
     }
     load(s);
     code = assemble(s->fused);
-    spend(&s->qp, &mark);
+    spend(&s->spent[QP], &mark);
     return code ? code : proceed(s, &mark);
 }
 
@@ -348,6 +350,6 @@ EXPORT int resume(StepData *s)
 {
     double mark = now();
     use_answers(s);
-    spend(&s->distance, &mark);
+    spend(&s->spent[DISTANCE], &mark);
     return proceed(s, &mark);
 }

@@ -64,6 +64,8 @@ class TipGoal(NamedTuple):
 
     def over(self, span: float) -> TipGoal:
         """Return the goal with rates per unit of progress along a piece of path of that `span`."""
+        if span == 1.0:
+            return self
         return TipGoal(self.position, self.rotation, self.velocity * span, self.spin * span)
 
 

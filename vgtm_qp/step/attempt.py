@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from enum import Enum
 from time import perf_counter
@@ -18,7 +19,7 @@ from vgtm_qp.qp.residual import AnswerError, FailedStepError, InfeasibleStepErro
 from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.acceptance import Acceptance
 from vgtm_qp.step.actuation import Actuation
-from vgtm_qp.step.driver import DEVIATION, LEAP, MOTION_MARGIN, TOO_FAR, Driver, can_drive
+from vgtm_qp.step.driver import DEVIATION, LEAP, MOTION_MARGIN, PHASES, TOO_FAR, Driver, can_drive
 from vgtm_qp.step.engine import Engine, FusedEngine
 from vgtm_qp.step.separation import RECOVERY, Separation
 from vgtm_qp.step.setup import Setup
@@ -70,11 +71,11 @@ class Phases:
         self.seconds[phase] += now - self._mark
         self._mark = now
 
-    def take(self, spent: dict[str, float]) -> None:
-        """Add the seconds in `spent`, which are set to zero."""
-        for phase, seconds in spent.items():
+    def take(self, phases: Sequence[str], spent: Array) -> None:
+        """Add the seconds `spent` in some phases, which are set to zero, and begin to count anew."""
+        for phase, seconds in zip(phases, spent.tolist(), strict=True):
             self.seconds[phase] += seconds
-            spent[phase] = 0.0
+        spent[:] = 0.0
         self.start()
 
 
@@ -170,7 +171,7 @@ class Attempt:
                 self._setup, engine, self.accuracy, self.acceptance, self.separation
             )
         taken = driver.take(state, target, share)
-        self.phases.take(driver.spent)
+        self.phases.take(PHASES, driver.spent)
         if taken is None:
             return None
         self.qps += 1

@@ -44,6 +44,9 @@ LEAP = 1.0
 DEVIATION = 0.1
 """Greatest deviation of points from their chords in one step, over the arm's length."""
 
+PHASES = "distance", "qp", "acceptance"
+"""Parts of a step whose times are known."""
+
 _ROOM = 64
 """Capacity at first: rows of clearance."""
 
@@ -74,8 +77,8 @@ class Driver:
 
     Attributes
     ----------
-    spent : dict of str to float
-        Seconds spent so far in each phase.
+    spent : (3,)
+        Seconds spent so far in the :data:`PHASES`; may be set to zero.
     """
 
     def __init__(
@@ -92,7 +95,7 @@ class Driver:
         self._work = self._solver.workspace
         self._held: State | None = None
         self._watch: Watch | None = None
-        self.spent = {"distance": 0.0, "qp": 0.0, "acceptance": 0.0}
+        self.spent = np.zeros(len(PHASES))
         self._started = self._is_placed = False
 
     def take(self, state: State, target: Target, share: float) -> Passage | None:
@@ -113,34 +116,32 @@ class Driver:
             return None
         if not self._started:
             self._start()
-        program, data = self._program, self._program.data
+        data = self._program.data
+        self._program.refresh()
         self._load(state, target, share)
         if watch is None:
             data.way = 0
         else:
             data.way = watch.started(state.nodes).address
             watch.refresh()
-        code, has_moved = program.call("take"), False
-        while code in (Code.ASKS, Code.ELSEWHERE, Code.CROWDED):
-            if code is Code.ASKS:
+        code, has_moved = self._take(), False
+        while code > Code.DONE:
+            if code == Code.ASKS:
                 self._ask()
-                code = program.call("resume")
-                continue
-            if code is Code.CROWDED:
+                code = self._resume()
+            elif code == Code.CROWDED:
                 self._make_room(2 * data.room)
-            elif has_moved:
-                break
-            else:
+                code = self._take()
+            elif code == Code.ELSEWHERE and not has_moved:
                 assert watch is not None
                 data.way, has_moved = watch.move_to(state.nodes, data.limit, data.self_limit).address, True
-            code = program.call("take")
+                code = self._take()
+            else:
+                return None
         if data.asked_for:
             assert monitor.scene.fcl is not None
             monitor.scene.fcl.refused += data.asked_for - data.proven
-        for phase in self.spent:
-            self.spent[phase] += getattr(data, phase)
-            setattr(data, phase, 0.0)
-        return self._passage(state, target) if code is Code.DONE else None
+        return self._passage(state, target)
 
     def _load(self, state: State, target: Target, share: float) -> None:
         """Write the step's state, goal and boxes."""
@@ -150,7 +151,8 @@ class Driver:
         self._solver.aim(self._accuracy)
         inputs[4][:], inputs[5][:] = target.lower, target.upper
         inputs[8][:], inputs[10][:] = goal.position, goal.velocity
-        inputs[9].reshape(3, 3)[:], inputs[11][:] = goal.rotation.T, goal.spin
+        if self._setup.task.turns is not None:
+            inputs[9].reshape(3, 3)[:], inputs[11][:] = goal.rotation.T, goal.spin
         if state is not self._held:
             arrays = state.q, state.nodes, state.control_vertices, state.quantities, state.motion
             for part, values in zip(self._parts, arrays, strict=False):
@@ -218,7 +220,7 @@ class Driver:
             group = watch.groups[self._group[k]].group
             piece = None if group.is_self else int(group.other[self._pair[k]])
             fcl.answer(self._questions[k], piece, self._answers[k])
-        self.spent["distance"] += perf_counter() - began
+        self.spent[0] += perf_counter() - began
 
     def _rows(self) -> ClearanceRows:
         """Return the rows of the last QP."""
@@ -297,6 +299,7 @@ class Driver:
             program.set(first=straight[0].astype(np.int32), last=straight[1].astype(np.int32))
         if levers is not None:
             program.set(levers=levers)
+        self._take, self._resume = program.entry("take"), program.entry("resume")
         program.set(
             fused=work.address,
             width=arm.home.size,
@@ -325,6 +328,7 @@ class Driver:
             relative=ROUNDING,
             tolerance=TOLERANCE,
             places=np.zeros((2, *arm.home.shape)),
+            spent=self.spent,
             **self._separation.pace,
             **_of_curve(layout),
         )

@@ -100,6 +100,8 @@ class Path:
         knots = self._knots
         k = min(max(bisect_right(knots, value) - 1, 0), len(knots) - 2)
         along = min(max(value, knots[k]), knots[k + 1]) - knots[k]
+        if along == 0.0:
+            return TipGoal(self.positions[k], self.rotations[k], self._velocity[k], self._spin[k])
         rotation = self.rotations[k]
         if self._turned[k]:
             rotation = rotation_from_vector(along * self._spin[k]) @ rotation
