@@ -114,6 +114,37 @@ class Tip:
         return np.asarray(self.weights @ X.take(self.nodes, axis=0))
 
 
+class Arithmetic(NamedTuple):
+    """An arm in arrays and functions for C, where one call takes the whole step.
+
+    Attributes
+    ----------
+    place : Kernel or None
+        A function of its own, q -> nodes (3, N); None where the nodes are the configuration.
+    bend : Kernel or None
+        A function of its own, (q, q) -> bounds (2 or more); the greater of the first two is four times
+        ``Arm.deviation``. None where nodes move straight when q does.
+    distances : bool
+        Whether quantity m is the distance of the nodes ``first[m]`` and ``last[m]``. If it is not, it is the coordinate
+        ``first[m]`` of q less ``multiplier[m]`` times the coordinate ``last[m]``.
+    first, last, multiplier : (M,)
+    levers : array or None
+        Factors of the coordinates' displacements whose sum is ``Arm.travel`` while the base rests; None where that is
+        the greatest displacement.
+    based : int array
+        Coordinates of q that only the base moves.
+    """
+
+    place: Kernel | None
+    bend: Kernel | None
+    distances: bool
+    first: Index
+    last: Index
+    multiplier: Array
+    levers: Array | None
+    based: Index
+
+
 class Description(Protocol):
     """A dataclass of counts that prints as text for people."""
 
@@ -340,12 +371,8 @@ class Arm(ABC):
     def nodes(self, q: Array) -> Array:
         """Return (N, 3) the nodes at a configuration, m."""
 
-    def placing(self) -> Kernel | None:
-        """Return a function of its own, q -> nodes (3, N); None where the nodes are the configuration."""
-        return None
-
-    def straight_quantities(self) -> tuple[Index, Index] | None:
-        """Return (M,), (M,) the nodes whose distances the quantities are; None where they are something else."""
+    def arithmetic(self) -> Arithmetic | None:
+        """Return what C has to know of the arm; None where the bodies' points are not the nodes."""
         return None
 
     def points(self, q: Array) -> Array:
@@ -377,14 +404,6 @@ class Arm(ABC):
     @abstractmethod
     def travel(self, motion: Array) -> float:
         """Return a bound of how far a node's coordinate moves in a displacement of the configuration, m."""
-
-    @property
-    def travel_levers(self) -> Array | None:
-        """Factors of the coordinates' displacements in the sum that is :meth:`travel` while the base is at rest.
-
-        None where it is the greatest of the displacements.
-        """
-        return None
 
     def furthest(self, q: Array, lower: Array, upper: Array) -> Array | None:  # noqa: ARG002
         """Return a displacement with the greatest move of each actuator in its box (n_a,); None if unknown.

@@ -5,6 +5,7 @@ A configuration q (J + 6,) holds the joints' values, rad or m, then position, m,
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,7 +14,7 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from vgtm_qp.arm.arm import Arm, Kinematics, Label, MotionPattern, Newton, Pose, between
+from vgtm_qp.arm.arm import Arithmetic, Arm, Kinematics, Label, MotionPattern, Newton, Pose, between
 from vgtm_qp.arm.symbols import ArmSymbols, Bound, Constants
 from vgtm_qp.arrays import Array, Index, Mask
 from vgtm_qp.compiled import Compiling, Kernel
@@ -159,9 +160,19 @@ class JointSpaceArm(Arm):
         kernel()
         return kernel.outputs[0].reshape(count, -1, 3).copy()
 
-    def placing(self) -> Kernel:
+    def arithmetic(self) -> Arithmetic:
         bound, compiling = self._placing
-        return bound.kernel(times=1, compiled=compiling)
+        count = len(self.quantity_names)
+        first, last, multiplier = np.arange(count), np.zeros(count, dtype=np.int64), np.zeros(count)
+        for joint, followed, factor in self.followers:
+            last[joint], multiplier[joint] = followed, factor
+        levers, based = np.concatenate([self._levers, np.zeros(6)]), count + np.arange(6)
+        place = bound.kernel(times=1, compiled=compiling)
+        return Arithmetic(place, self.bending(), False, first, last, multiplier, levers, based)
+
+    @abstractmethod
+    def bending(self) -> Kernel:
+        """Return ``Arithmetic.bend``."""
 
     @cached_property
     def _known_nodes(self) -> dict[bytes, Array]:
@@ -223,10 +234,6 @@ class JointSpaceArm(Arm):
         if base.any():
             joints += 2.0 * float(np.linalg.norm(base[3:])) * self.reaches[0] + np.abs(base[:3]).max()
         return float(joints)
-
-    @property
-    def travel_levers(self) -> Array:
-        return np.concatenate([self._levers, np.zeros(6)])
 
     @cached_property
     def _levers(self) -> Array:

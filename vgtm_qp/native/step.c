@@ -9,23 +9,23 @@
 typedef struct {
     Fused *fused;
     Way *way;                      /* null if no two bodies, and no body and piece, can ever be near */
-    Kernel place;                  /* (q) -> (N, 3) nodes; eval is null where the nodes are q */
+    /* See arm.Arithmetic; without an eval the nodes are q, or move straight. (tip's nodes) -> its rotation. */
+    Kernel place, bend, frame;
 
-    /* Numbers of: coordinates of the nodes; quantities; the base's nodes and their numbers; the axes of the tip's
-       position, and these. */
+    /* Numbers of: coordinates of the nodes; quantities; coordinates of q that only the base moves, and these; the axes of
+       the tip's position, and these. */
     int width, quantities, based;
     const int *base;
     int axes;
     const int *axis;
-    /* Whether quantities are the distances of nodes, so that they are measured here; otherwise the caller does that. Whether
-       bodies move on straight lines between two states, so that the way is proven here. */
-    int measures, proves;
-    const int *first, *last, *actuator;    /* (M), (M): ends of members; (n_a) */
-    const double *home;                    /* (M) */
+    int distances;                         /* see arm.Arithmetic */
+    const int *first, *last, *actuator;    /* (M), (M), (n_a) */
+    const double *multiplier, *home;       /* (M) */
     const double *levers;                  /* (coordinates) bounds of how far a node moves per change of each; or null */
     const double *tip_weight;              /* (K) of the tip's nodes */
     const int *tip_node;
-    int tip_nodes;
+    int tip_nodes, turns;                  /* coordinates of the tip's turn that are tracked: 0, 2 for its z-axis, or 3 */
+    double unit;                           /* of the arm, m: by which angles become lengths */
 
     /* The curve: tracked stations S with their nodes and weights (S, 3), weights (S, V) of their places on it; weights and
        slopes (V) of its end, and the gain (V, 1 or 2) from the errors of place and slope there. */
@@ -37,6 +37,7 @@ typedef struct {
     /* Clearances, the margin of their rows, the distance of pairs that are far, share and least of a pair's approach;
        rounding of a distance. */
     double safe, self_safe, margin, influence, share_of_way, least_way, rounding;
+    double between, deviation;             /* violation that is allowed between states; greatest deviation from chords */
     /* Whether another program supplies the contacts of rows that press: with multipliers above this. Its unit of length
        per m; the greatest flaw of a proven answer, and the least distance of axes that have one, m. */
     int asks;
@@ -54,7 +55,7 @@ typedef struct {
     double *q, *nodes, *vertices, *values, *motion;
     double *next_q, *next_nodes, *next_vertices, *next_values, *next_motion, *next_rates, *next_tip;
     double duration;
-    double *places;                        /* (2, N, 3) */
+    double *places;                        /* (MOST_PIECES + 1, N, 3) */
 
     /* Rows of clearance: their contacts (R, 9), numbers of group and pair, and in which round they were asked for, 0 in
        none; middle and span of the body and of the other body (R, 12), and the answer (R, 7): a distance, a point of the
@@ -68,6 +69,9 @@ typedef struct {
 } StepData;
 
 enum { DISTANCE, QP, ACCEPTANCE };
+
+/* Greatest number of pieces into which a motion is cut if points leave their chords. */
+enum { MOST_PIECES = 16 };
 
 static double now(void)
 {
@@ -194,6 +198,55 @@ static void use_answers(StepData *s)
     }
 }
 
+/* C (3, 3) = A B, column by column. */
+static void product(const double *A, const double *B, double *C)
+{
+    for (int j = 0; j < 3; j++)
+        for (int i = 0; i < 3; i++) C[3 * j + i] = A[i] * B[3 * j] + A[3 + i] * B[3 * j + 1] + A[6 + i] * B[3 * j + 2];
+}
+
+/* The rotation (3, 3), column by column, by |vector| about it. */
+static void rotation_by(const double *vector, double *R)
+{
+    double angle = norm(vector, 3), c = cos(angle), axis[3];
+    double s = angle > 0.0 ? sin(angle) / angle : 1.0;
+    for (int a = 0; a < 3; a++) axis[a] = angle > 0.0 ? vector[a] / angle : 0.0;
+    for (int j = 0; j < 3; j++)
+        for (int i = 0; i < 3; i++) R[3 * j + i] = (1.0 - c) * axis[i] * axis[j] + (i == j ? c : 0.0);
+    for (int k = 0; k < 3; k++) {
+        int i = (k + 1) % 3, j = (k + 2) % 3;
+        R[3 * i + j] += s * vector[k];
+        R[3 * j + i] -= s * vector[k];
+    }
+}
+
+/* The angle, rad, from the tip's z-axis or orientation, as its nodes have it, to the goal's. */
+static double turn_missing(StepData *s)
+{
+    const Fused *f = s->fused;
+    double spin[3], turning[9], goal[9], w[3] = {0.0, 0.0, 0.0}, cosine = 0.0;
+    for (int k = 0; k < s->tip_nodes; k++)
+        memcpy((double *)s->frame.arg[0] + 3 * k, s->next_nodes + 3 * s->tip_node[k], sizeof(double) * 3);
+    if (call(&s->frame)) return NAN;
+    const double *tip = s->frame.res[0];
+    for (int a = 0; a < 3; a++) spin[a] = *f->gone * f->spin[a];
+    rotation_by(spin, turning);
+    product(turning, f->condense.arg[9], goal);
+    if (s->turns == 2) {
+        cross(tip + 6, goal + 6, w);
+        cosine = dot(tip + 6, goal + 6, 3);
+    } else {
+        /* Of the rotation from one to the other: its axis times twice its sine, and twice its cosine. */
+        for (int j = 0; j < 3; j++) {
+            double part[3];
+            cross(tip + 3 * j, goal + 3 * j, part);
+            for (int a = 0; a < 3; a++) w[a] += part[a];
+        }
+        cosine = dot(tip, goal, 9) - 1.0;
+    }
+    return atan2(norm(w, 3), cosine);
+}
+
 /* Whether the state that was settled keeps its quantities, its limits and its goal, measured anew by plain arithmetic. */
 static int is_flawless(StepData *s)
 {
@@ -201,20 +254,24 @@ static int is_flawless(StepData *s)
     const double *x = s->next_nodes, *lower = f->condense.arg[4], *upper = f->condense.arg[5];
     double rounding = s->relative * norm(f->q, f->coordinates), beyond = 0.0, wrong = 0.0, off = 0.0;
     for (int i = 0; i < s->based; i++)
-        for (int a = 0; a < 3; a++)
-            if (x[3 * s->base[i] + a] != s->nodes[3 * s->base[i] + a]) return 0;
+        if (f->q[s->base[i]] != s->q[s->base[i]]) return 0;
     for (int m = 0, k = 0; m < s->quantities; m++) {
-        double length = sqrt(square_of(x + 3 * s->first[m], x + 3 * s->last[m]));
+        double value = s->distances ? sqrt(square_of(x + 3 * s->first[m], x + 3 * s->last[m]))
+                                    : f->q[s->first[m]] - s->multiplier[m] * f->q[s->last[m]];
         int is_actuator = k < f->actuators && s->actuator[k] == m;
         double least = is_actuator ? lower[k] : s->home[m], greatest = is_actuator ? upper[k] : s->home[m];
-        double out = fmax(length - greatest, least - length);
+        double out = fmax(value - greatest, least - value);
         if (!(out <= 0.0)) beyond += out * out;
-        wrong += (length - s->next_values[m]) * (length - s->next_values[m]);
+        wrong += (value - s->next_values[m]) * (value - s->next_values[m]);
         k += is_actuator;
     }
     for (int i = 0; i < s->axes; i++) {
         double error = f->condense.arg[8][s->axis[i]] + *f->gone * f->velocity[s->axis[i]];
         for (int k = 0; k < s->tip_nodes; k++) error -= s->tip_weight[k] * x[3 * s->tip_node[k] + s->axis[i]];
+        off += error * error;
+    }
+    if (s->turns) {
+        double error = s->unit * turn_missing(s);
         off += error * error;
     }
     /* NaN fails the comparisons. */
@@ -277,11 +334,71 @@ static double greatest_gap(const StepData *s)
     return sqrt(worst);
 }
 
+/* Whether every pair keeps its clearance at the present place of the way. */
+static int is_clear(const StepData *s)
+{
+    for (int g = 0; g < s->way->groups; g++) {
+        const Pairs *p = s->way->group[g];
+        double floor = (p->is_self ? s->self_safe : s->safe) - s->rounding;
+        for (int k = 0; k < p->count; k++)
+            if (!(p->lower[k] >= floor)) return 0;
+    }
+    return 1;
+}
+
+/* Prove the way to the next state in a number of pieces on which q moves straight, each with `spare` added to its floors. */
+static int pass(StepData *s, int pieces, double spare)
+{
+    const Fused *f = s->fused;
+    Way *w = s->way;
+    int size = s->width;
+    if (memcmp(w->place, s->nodes, sizeof(double) * size)) {
+        /* A try before this one led away. */
+        memcpy(s->places, w->place, sizeof(double) * size);
+        memcpy(s->places + size, s->nodes, sizeof(double) * size);
+        w->pieces = 1;
+        w->places = s->places;
+        w->floor = w->self_floor = -INFINITY;
+        int code = advance_pairs(w);
+        if (code) return code;
+    }
+    memcpy(s->places, s->nodes, sizeof(double) * size);
+    for (int k = 1; k < pieces; k++) {
+        double share = (double)k / pieces, *q = (double *)s->place.arg[0];
+        for (int i = 0; i < f->coordinates; i++) q[i] = (1.0 - share) * s->q[i] + share * s->next_q[i];
+        if (call(&s->place)) return NO_VALUE;
+        memcpy(s->places + k * size, s->place.res[0], sizeof(double) * size);
+    }
+    memcpy(s->places + pieces * size, s->next_nodes, sizeof(double) * size);
+    w->pieces = pieces;
+    w->places = s->places;
+    w->floor = s->safe + spare;
+    w->self_floor = fmax(s->self_safe + spare, 0.0);
+    return advance_pairs(w);
+}
+
+/* Prove the way to the next state; see Separation.between. */
+static int prove_way(StepData *s)
+{
+    if (!s->bend.eval) return s->way ? pass(s, 1, -s->rounding) : DONE;
+    double **arg = (double **)s->bend.arg;
+    memcpy(arg[0], s->q, sizeof(double) * s->fused->coordinates);
+    memcpy(arg[1], s->next_q, sizeof(double) * s->fused->coordinates);
+    if (call(&s->bend)) return NO_VALUE;
+    double deviation = 0.25 * fmax(s->bend.res[0][0], s->bend.res[0][1]);
+    if (!(deviation < s->deviation)) return FLAWED;
+    if (!s->way) return DONE;
+    /* In k pieces, the deviation from the chords is 1 / k^2 of the whole. Most motions need only one piece. */
+    double needed = deviation >= s->unit ? 1.0 : fmin(ceil(sqrt(fmax(deviation / s->between, 1.0))), MOST_PIECES);
+    int pieces = (int)needed, code = pass(s, 1, deviation - s->between);
+    if (code == NOT_PROVEN && pieces > 1) code = pass(s, pieces, deviation / (needed * needed) - s->between);
+    return code || is_clear(s) ? code : NOT_PROVEN;
+}
+
 /* Check where the answer led, and prove the way there. */
 static int arrive(StepData *s)
 {
     Fused *f = s->fused;
-    Way *w = s->way;
     double furthest = 0.0;
     if (!(f->furthest < s->furthest)) return FLAWED;
     for (int k = 0; k < 3 * f->vertices; k++) furthest = fmax(furthest, fabs(f->points[k] - s->vertices[k]));
@@ -294,7 +411,7 @@ static int arrive(StepData *s)
         memcpy(s->next_nodes, s->place.res[0], sizeof(double) * s->width);
     }
     memcpy(s->next_values, f->close.res[1], sizeof(double) * s->quantities);
-    if (s->measures && !is_flawless(s)) return FLAWED;
+    if (!is_flawless(s)) return FLAWED;
     end_curve(s);
     if (reverses(s)) return FLAWED;
     s->gap = greatest_gap(s);
@@ -304,14 +421,7 @@ static int arrive(StepData *s)
     memcpy(s->next_tip, f->missing.res[1], sizeof(double) * 3);
     for (int a = 0; a < 3; a++)
         for (int b = 0; b < 3; b++) s->next_tip[3 + 3 * a + b] = f->missing.res[2][3 * b + a];
-    if (!w || !s->proves) return DONE;
-    memcpy(s->places, s->nodes, sizeof(double) * s->width);
-    memcpy(s->places + s->width, s->next_nodes, sizeof(double) * s->width);
-    w->pieces = 1;
-    w->places = s->places;
-    w->floor = s->safe - s->rounding;
-    w->self_floor = fmax(s->self_safe - s->rounding, 0.0);
-    return advance_pairs(w);
+    return prove_way(s);
 }
 
 /* Answer the QP; go there, unless rows press whose contacts are to be asked for first. */

@@ -167,9 +167,7 @@ class Attempt:
         """Return the step in one call; None if it is no usual one."""
         driver = self._drivers.get(engine)
         if driver is None:
-            driver = self._drivers[engine] = Driver(
-                self._setup, engine, self.accuracy, self.acceptance, self.separation
-            )
+            driver = self._drivers[engine] = Driver(self._setup, engine, self.accuracy, self.separation)
         taken = driver.take(state, target, share)
         self.phases.take(PHASES, driver.spent)
         if taken is None:

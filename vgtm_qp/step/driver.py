@@ -13,8 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vgtm_qp.arm.arm import Pose
-from vgtm_qp.arrays import Array
+from vgtm_qp.arm.arm import Pose, tip_function
 from vgtm_qp.geometry.exact import CONTACT, NORMAL_FROM, PROOF
 from vgtm_qp.geometry.pairs import Pair
 from vgtm_qp.geometry.watch import AHEAD, Watch
@@ -25,11 +24,11 @@ from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.qp.residual import TOLERANCE
 from vgtm_qp.rows.tip import axes
-from vgtm_qp.step.acceptance import LOOSER, ROUNDING, Acceptance
+from vgtm_qp.step.acceptance import LOOSER, ROUNDING
 from vgtm_qp.step.engine import FusedEngine
-from vgtm_qp.step.separation import Separation
+from vgtm_qp.step.separation import MOST_PIECES, Separation
 from vgtm_qp.step.setup import Setup
-from vgtm_qp.step.state import Shortfall, State
+from vgtm_qp.step.state import State
 from vgtm_qp.step.target import Target
 
 MOTION_MARGIN = 2.5
@@ -69,7 +68,7 @@ def can_drive(setup: Setup) -> bool:
     arm, layout = setup.arm, setup.layout
     is_plain = layout.general is None and layout.own is None and setup.base_motion is None
     without_limits = setup.minimum_angle == 0.0 and setup.step_limit == np.inf
-    return is_plain and without_limits and len(arm.points(arm.home_configuration)) == len(arm.home)
+    return is_plain and without_limits and arm.arithmetic() is not None
 
 
 class Driver:
@@ -86,11 +85,10 @@ class Driver:
         setup: Setup,
         engine: FusedEngine,
         accuracy: Accuracy,
-        acceptance: Acceptance,
         separation: Separation,
     ) -> None:
         self._setup, self._engine, self._accuracy = setup, engine, accuracy
-        self._acceptance, self._separation = acceptance, separation
+        self._separation = separation
         self._solver, self._layout = engine.solver, engine.layout
         self._work = self._solver.workspace
         self._held: State | None = None
@@ -169,18 +167,9 @@ class Driver:
         q, nodes, vertices, values, motion, rates, tip = (block[part] for part in self._parts)
         q, nodes = q.reshape(work.shape), nodes.reshape(-1, 3)
         vertices, progress, gap = vertices.reshape(-1, 3), work.data.reached, data.gap
-        shortfall: Shortfall | None = {}
         if layout.hard_turns:
             gap = self._setup.gap(q, vertices, state.torsion, None)
             if layout.hard_tracking and not gap <= self._accuracy.tracking:
-                return None
-        if not data.measures:
-            closed, goal = work.closed(), target.goal(progress)
-            if self._acceptance.flaw(closed, state.q, target, goal, vertices, state.torsion):
-                return None
-        if data.way and not data.proves:
-            shortfall = self._proven(state, q, target)
-            if shortfall is None:
                 return None
         time, late = state.after(target.duration)
         then = State(
@@ -193,7 +182,7 @@ class Driver:
             rates=rates,
             motion=motion.reshape(q.shape),
             duration=target.duration,
-            shortfall=shortfall,
+            shortfall={},
             late=late,
             tip=Pose(tip[:3], tip[3:].reshape(3, 3)),
         )
@@ -202,14 +191,6 @@ class Driver:
         return Passage(
             then, progress, gap if layout.tracked.size else np.nan, self._solver.answered(), self._rows()
         )
-
-    def _proven(self, state: State, q: Array, target: Target) -> Shortfall | None:
-        """Return the pairs that are too near at `q`; None if the way there is too long or not proven."""
-        separation, height = self._separation, self._setup.arm.height
-        if not separation.deviation(state.q, q) < DEVIATION * height:
-            return None
-        report, after = separation.proof(state, q, target.time, {})
-        return after if report.certified else None
 
     def _ask(self) -> None:
         """Have FCL answer the questions of this round."""
@@ -290,26 +271,33 @@ class Driver:
             program.set(**{f"next_{name}": self._after[part]})
         self._nodes = self._before[self._parts[1]].reshape(-1, 3)
         self._make_room(_ROOM)
-        placing, straight, levers = arm.placing(), arm.straight_quantities(), arm.travel_levers
-        base, tip = np.flatnonzero(arm.base), arm.end_effector
-        self._is_placed = placing is None
-        if placing is not None:
-            program.set(place=placing)
-        if straight is not None:
-            program.set(first=straight[0].astype(np.int32), last=straight[1].astype(np.int32))
-        if levers is not None:
-            program.set(levers=levers)
+        known, tip = arm.arithmetic(), arm.end_effector
+        assert known is not None
+        self._is_placed = known.place is None
+        if known.place is not None:
+            program.set(place=known.place)
+        if known.bend is not None:
+            program.set(bend=known.bend)
+        if known.levers is not None:
+            program.set(levers=known.levers)
+        if setup.task.turns is not None:
+            program.set(frame=tip_function(arm).kernel())
         self._take, self._resume = program.entry("take"), program.entry("resume")
         program.set(
             fused=work.address,
             width=arm.home.size,
             quantities=len(arm.quantity_names),
-            based=len(base),
-            base=base.astype(np.int32),
+            based=len(known.based),
+            base=known.based.astype(np.int32),
+            distances=int(known.distances),
+            first=known.first.astype(np.int32),
+            last=known.last.astype(np.int32),
+            multiplier=known.multiplier,
             axes=len(axes(layout.tip_rows)),
             axis=np.array(axes(layout.tip_rows), dtype=np.int32),
-            measures=int(straight is not None and setup.task.turns is None),
-            proves=int(not arm.leaves_chords),
+            turns=len(layout.tip_rows) - len(axes(layout.tip_rows)),
+            unit=arm.unit,
+            deviation=DEVIATION * arm.height,
             actuator=arm.actuators.astype(np.int32),
             home=arm.home_quantities,
             tip_nodes=len(tip.nodes),
@@ -327,7 +315,7 @@ class Driver:
             tracking=self._accuracy.tracking,
             relative=ROUNDING,
             tolerance=TOLERANCE,
-            places=np.zeros((2, *arm.home.shape)),
+            places=np.zeros((MOST_PIECES + 1, *arm.home.shape)),
             spent=self.spent,
             **self._separation.pace,
             **_of_curve(layout),

@@ -31,7 +31,7 @@ _APPROACH = 0.4
 _LEAST_APPROACH = 2e-3
 """Approach that a slowing pair is always allowed in one step, over the arm's unit."""
 
-_MOST_PIECES = 16
+MOST_PIECES = 16
 """Greatest number of pieces into which a motion is cut if points leave their chords."""
 
 _NEAR_ANGLE = 0.3
@@ -63,9 +63,13 @@ class Separation:
 
     @property
     def pace(self) -> dict[str, float]:
-        """Share and least of the approach of a slowing pair, m, and the rounding of a clearance, m; for ``step.c``."""
-        least = _LEAST_APPROACH * self._unit
-        return {"share_of_way": self._approach, "least_way": least, "rounding": self._rounding}
+        """By name what ``step.c`` knows: share and least of the approach of a slowing pair, and tolerances, m."""
+        return {
+            "share_of_way": self._approach,
+            "least_way": _LEAST_APPROACH * self._unit,
+            "rounding": self._rounding,
+            "between": self._between,
+        }
 
     def shortfall(self, q: Array, time: float, *, tracked: bool = False) -> Shortfall:
         """Return the pairs that are too near at a configuration; usually there are none.
@@ -130,7 +134,7 @@ class Separation:
         # piece.
         is_far = deviation >= self._unit
         needed = 1 if is_far else math.ceil(math.sqrt(max(deviation / self._between, 1.0)))
-        tries = sorted({1, min(needed, _MOST_PIECES)})
+        tries = sorted({1, min(needed, MOST_PIECES)})
         for pieces in tries:
             spare = deviation / pieces**2 - self._between
             floors = floor + spare, max(self_floor + spare, 0.0)

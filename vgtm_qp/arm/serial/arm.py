@@ -155,9 +155,12 @@ class SerialArm(JointSpaceArm):
         nodes, tip, beyond = bend.outputs[0]
         return float(max(nodes, tip + beyond * reach)) / 8.0
 
+    def bending(self) -> Kernel:
+        return bend_function(self.chain).kernel()
+
     @cached_property
     def _bend(self) -> Kernel:
-        return bend_function(self.chain).kernel()
+        return self.bending()
 
     def approach(self, motion: Array) -> Approach:
         """See ``arm.Arm``.

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from vgtm_qp.arm.arm import Arm, Kinematics, Label, MotionPattern, Newton, Pose, Stations, Tip
+from vgtm_qp.arm.arm import Arithmetic, Arm, Kinematics, Label, MotionPattern, Newton, Pose, Stations, Tip
 from vgtm_qp.arm.frames import frame_constants
 from vgtm_qp.arm.symbols import Constants
 from vgtm_qp.arm.truss.bounds import chord_deviation, frame_deviation, hollow, longest_paths
@@ -66,9 +66,12 @@ class TrussArm(Arm):
         """Return the configuration itself."""
         return q
 
-    def straight_quantities(self) -> tuple[Index, Index] | None:
+    def arithmetic(self) -> Arithmetic | None:
         """See ``arm.Arm``; with offset joints the ends of members are no nodes."""
-        return (self._first, self._last) if self.truss.joints is None else None
+        if self.truss.joints is not None:
+            return None
+        based = np.flatnonzero(np.repeat(self.base, 3))
+        return Arithmetic(None, None, True, self._first, self._last, np.zeros(len(self._first)), None, based)
 
     def measured(self, q: Array) -> Array:
         """See ``arm.Arm``: the distances of the members' ends."""
