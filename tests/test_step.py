@@ -330,12 +330,14 @@ def crate_problem():
 
 
 def snapshot(state):
-    return {field.name: np.copy(getattr(state, field.name)) for field in dataclasses.fields(state)}
+    kept = {field.name: getattr(state, field.name) for field in dataclasses.fields(state)}
+    kept["tip"] = () if state.tip is None else np.concatenate([state.tip.position[None], state.tip.rotation])
+    return {name: np.copy(value) for name, value in kept.items()}
 
 
 def assert_same(state, kept):
-    for name, value in kept.items():
-        np.testing.assert_array_equal(getattr(state, name), value, err_msg=name)
+    for name, value in snapshot(state).items():
+        np.testing.assert_array_equal(kept[name], value, err_msg=name)
 
 
 WRONG_GOALS = [

@@ -54,7 +54,7 @@ def vector_near(rotation: Array, near: Array) -> Array:
 
 def turn_between(start: Array, end: Array) -> Array:
     """Return the least rotation vector (3,), rad, that takes unit vector `start` to unit vector `end`."""
-    axis = np.cross(start, end)
+    axis = _cross_matrix(start) @ end
     sine = float(np.linalg.norm(axis))
     angle = float(np.arctan2(sine, float(start @ end)))
     if sine > 1e-12:
@@ -67,4 +67,5 @@ def turn_between(start: Array, end: Array) -> Array:
 
 
 def _cross_matrix(v: Array) -> Array:
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+    x, y, z = v.tolist()
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

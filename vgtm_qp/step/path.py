@@ -60,16 +60,14 @@ class Path:
         object.__setattr__(self, "_spin", spin)
 
     @classmethod
-    def straight(cls, position: Array, rotation: Array, to: Array, turned: Array) -> Path:
-        """Return the path from 0 to 1 from a pose, (3,) and (3, 3), to another.
+    def straight(cls, position: Array, rotation: Array, to: Array, turned: Array, spin: Array | None) -> Path:
+        """Return the path from 0 to 1 from a pose, (3,) and (3, 3), to another; it turns by `spin` (3,), rad, or not.
 
         Raises
         ------
         GoalError
             A number of a position is not finite.
         """
-        if turned is not rotation:
-            return cls(np.array([0.0, 1.0]), np.array([position, to]), np.array([rotation, turned]))
         # A control loop makes one for each step, so the general way would cost as much as the step's rows.
         path, velocity = object.__new__(cls), to - position
         if not math.isfinite(sum(velocity.tolist())):
@@ -77,11 +75,11 @@ class Path:
         path.__dict__.update(
             knots=_UNIT,
             positions=np.array([position, to]),
-            rotations=np.array([rotation, rotation]),
+            rotations=np.array([rotation, turned]),
             _knots=[0.0, 1.0],
-            _turned=[False],
+            _turned=[spin is not None],
             _velocity=velocity[None],
-            _spin=_AT_REST,
+            _spin=_AT_REST if spin is None else spin[None],
         )
         return path
 

@@ -235,7 +235,7 @@ class Resolver(ChangingScene):
     def tip(self) -> tuple[Array, Array]:
         """Return position (3,), m, and rotation (3, 3) of the end effector in the present state."""
         if (known := self.state.tip) is not None:
-            return known.position, known.rotation
+            return known.position.copy(), known.rotation.copy()
         with self._lock:
             kinematics, nodes = self.setup.kinematics, self.state.nodes
             kinematics.evaluate_tip(nodes)

@@ -14,7 +14,7 @@ from vgtm_qp.arrays import Array
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.errors import GoalError
 from vgtm_qp.qp.numbers import norm
-from vgtm_qp.rotation import rotation_from_vector, turn_between
+from vgtm_qp.rotation import rotation_from_vector, turn_between, vector_from_rotation
 from vgtm_qp.rows.tip import TipGoal, axes, levers, row_names, tip_function
 from vgtm_qp.step.path import Path
 
@@ -118,16 +118,18 @@ class TipTask:
             raise GoalError(f"give pointing or rotation_vector, not both; {_UNCHANGED}")
         here, rotation = tip
         there = here if position is None else vector(position, "position")
-        turned = rotation
+        turned, spin = rotation, None
         if pointing is not None:
             wanted = vector(pointing, "pointing")
             norm = float(np.linalg.norm(wanted))
             if norm < 1e-9:
                 raise GoalError(f"pointing must not be the zero vector; {_UNCHANGED}")
-            turned = rotation_from_vector(turn_between(rotation[:, 2], wanted / norm)) @ rotation
+            spin = turn_between(rotation[:, 2], wanted / norm)
+            turned = rotation_from_vector(spin) @ rotation
         elif rotation_vector is not None:
             turned = rotation_from_vector(vector(rotation_vector, "rotation_vector"))
-        return Path.straight(here, rotation, there, turned)
+            spin = vector_from_rotation(turned @ rotation.T)
+        return Path.straight(here, rotation, there, turned, spin)
 
 
 def over_all_nodes(arm: Arm, response: Array) -> Array:
