@@ -87,7 +87,8 @@ def compare(problem: vq.Problem, rng: np.random.Generator, count: int, tolerance
         if brakes and not found.status == expected.status == vq.StepStatus.REACHED:
             # The other arm does not know how this one was to brake.
             break
-        assert_same(found, expected, tolerance)
+        # Further QPs start from where the first one led, to the accuracy of the solver.
+        assert_same(found, expected, tolerance if found.qps == 1 else 100.0 * tolerance)
         assert (one.state is before) == (not found.moved)
 
 

@@ -64,7 +64,7 @@ typedef struct {
     double *contacts, *questions, *answers;
     int *group, *pair, *asked;
 
-    double limit, self_limit, gap;
+    double reach, limit, self_limit, gap;
     double *spent;                         /* (3) s in each phase so far: distance, QP, acceptance */
 } StepData;
 
@@ -149,15 +149,16 @@ static void load(StepData *s)
 static void look_ahead(StepData *s)
 {
     Fused *f = s->fused;
-    double last = 0.0, asked = 0.0, reach = s->influence;
+    double last = 0.0, asked = 0.0;
     for (int i = 0; i < f->coordinates; i++) {
         double moved = fabs(s->share * s->motion[i]);
         last = s->levers ? last + moved * s->levers[i] : fmax(last, moved);
     }
     for (int a = 0; a < 3; a++) asked = fmax(asked, fabs(f->velocity[a]));
-    if (s->share >= 1.0) reach = s->motion_margin * (last == 0.0 ? s->influence : fmax(last, asked));
-    s->limit = fmin(s->influence, s->safe + reach);
-    s->self_limit = fmin(s->influence, s->self_safe + 2.0 * reach);
+    s->reach = s->influence;
+    if (s->share >= 1.0) s->reach = s->motion_margin * (last == 0.0 ? s->influence : fmax(last, asked));
+    s->limit = fmin(s->influence, s->safe + s->reach);
+    s->self_limit = fmin(s->influence, s->self_safe + 2.0 * s->reach);
 }
 
 /* Ask for the contacts of the rows that press, but for those that were asked for before; return whether there are any. */

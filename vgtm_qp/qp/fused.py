@@ -152,17 +152,21 @@ class FusedSolver:
         InfeasibleStepError, SolverError
             As :meth:`solve`.
         """
-        near, work = self.workspace.take(clearance), self.workspace
-        code, data = work.check(work.call("move", TOLERANCE)), work.data
+        self.workspace.take(clearance)
+        work, data = self.workspace, self.workspace.data
+        code = work.check(work.call("move", TOLERANCE))
         if code == Code.INACCURATE:
             refuse_large(data.primal, data.dual, work.status)
-        solution, is_settled = self._solution(work.x, near, _NOWHERE, _NOWHERE), code == Code.DONE
+        return self.led(torsion, is_settled=code == Code.DONE)
+
+    def led(self, torsion: Array, *, is_settled: bool) -> Move:
+        """Return where the answer of the QP solved last led; see :meth:`move`."""
+        work, solution = self.workspace, self.answered()
         points = work.points if is_settled else work.started_points
         q, vertices = work.started.reshape(work.shape).copy(), points.reshape(-1, 3).copy()
         torsion = torsion + solution.torsion if len(torsion) else torsion
-        return Move(
-            solution, q, vertices, torsion, data.reached, data.furthest, work.closed() if is_settled else None
-        )
+        closed = work.closed() if is_settled else None
+        return Move(solution, q, vertices, torsion, work.data.reached, work.data.furthest, closed)
 
     def settle(
         self, q: Array, curve: CurvePoint, lower: Array, upper: Array, goal: TipGoal

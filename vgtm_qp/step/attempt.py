@@ -19,7 +19,17 @@ from vgtm_qp.qp.residual import AnswerError, FailedStepError, InfeasibleStepErro
 from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.acceptance import Acceptance
 from vgtm_qp.step.actuation import Actuation
-from vgtm_qp.step.driver import DEVIATION, LEAP, MOTION_MARGIN, PHASES, TOO_FAR, Driver, can_drive
+from vgtm_qp.step.driver import (
+    DEVIATION,
+    LEAP,
+    MOTION_MARGIN,
+    PHASES,
+    TOO_FAR,
+    Begun,
+    Driver,
+    Passage,
+    can_drive,
+)
 from vgtm_qp.step.engine import Engine, FusedEngine
 from vgtm_qp.step.separation import RECOVERY, Separation
 from vgtm_qp.step.setup import Setup
@@ -147,15 +157,19 @@ class Attempt:
         engine: Engine,
     ) -> Step:
         """Return an engine's step that drives apart pairs too near, or if that fails keeps their distance."""
-        short = self.separation.shortfall_of(state)
+        short, begun = self.separation.shortfall_of(state), None
         if self._can_drive and not short and progress == 0.0 and isinstance(engine, FusedEngine):
             driven = self._driven(state, target, share, engine)
-            if driven is not None:
+            if isinstance(driven, Step):
                 return driven
+            begun = driven
         for gain in (self._recovery(short), 0.0) if short else (0.0,):
-            asked, reach = self._first(state, target, share, progress, short, gain)
             try:
-                step = self._run(state, asked, reach, short, gain, engine)
+                if begun is not None:
+                    step = self._run(state, target, begun, begun.reach, short, gain, engine)
+                else:
+                    asked, reach = self._first(state, target, share, progress, short, gain)
+                    step = self._run(state, target, asked, reach, short, gain, engine)
             except CurveError as error:
                 # A trial curve may have no frame; that of a shorter piece may have one.
                 step = Step(StepStatus.BLOCKED, 0.0, state, str(error), 1, True)
@@ -163,15 +177,15 @@ class Attempt:
                 break
         return step
 
-    def _driven(self, state: State, target: Target, share: float, engine: FusedEngine) -> Step | None:
-        """Return the step in one call; None if it is no usual one."""
+    def _driven(self, state: State, target: Target, share: float, engine: FusedEngine) -> Step | Begun | None:
+        """Return the step in one call, or its beginning if it needs further QPs; None if it is no usual one."""
         driver = self._drivers.get(engine)
         if driver is None:
             driver = self._drivers[engine] = Driver(self._setup, engine, self.accuracy, self.separation)
         taken = driver.take(state, target, share)
         self.phases.take(PHASES, driver.spent)
-        if taken is None:
-            return None
+        if not isinstance(taken, Passage):
+            return taken
         self.qps += 1
         of_qp = {"qps": 1, "solution": taken.solution, "rows": taken.rows}
         return self._accepted(taken.state, taken.progress, taken.gap, **of_qp)
@@ -216,14 +230,15 @@ class Attempt:
     def _run(
         self,
         state: State,
-        asked: QPInput,
+        target: Target,
+        begin: QPInput | Begun,
         reach: float,
         short: Shortfall,
         gain: float,
         engine: Engine,
     ) -> Step:
-        """Run the attempt from its first input; `short` are pairs to drive apart by `gain`, m."""
-        phases, separation, target = self.phases, self.separation, asked.target
+        """Run the attempt from its first input or after its first QP; `short` pairs are driven apart by `gain`, m."""
+        phases, separation = self.phases, self.separation
         q, fractions = state.q, list[float]()
         rows: ClearanceRows | None = None
         first: Move | None = None
@@ -245,17 +260,19 @@ class Attempt:
                 near = separation.rows(q, target.time, 0.0, reach, short, gain, expected=furthest)
                 near = separation.with_rows_between(near, state, q, target.time, fractions)
                 at = q, q, move.vertices, move.torsion
-                asked = QPInput(*at, target, target.goal(move.progress), move.progress, near, False)
+                begin = QPInput(*at, target, target.goal(move.progress), move.progress, near, False)
             phases.add("distance")
             self.qps += 1
             try:
-                move = engine.move(asked, self.accuracy, phases.add)
+                move = (
+                    begin.move if isinstance(begin, Begun) else engine.move(begin, self.accuracy, phases.add)
+                )
             except SolverError as error:
                 return blocked(*_reason(error))
             finally:
                 phases.add("correction")
             if first is None:
-                first, rows = move, asked.rows
+                first, rows = move, begin.rows
             q = move.q
             beyond = self._leap(state, move)
             if beyond:

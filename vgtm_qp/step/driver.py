@@ -18,7 +18,7 @@ from vgtm_qp.geometry.exact import CONTACT, NORMAL_FROM, PROOF
 from vgtm_qp.geometry.pairs import Pair
 from vgtm_qp.geometry.watch import AHEAD, Watch
 from vgtm_qp.native import Code, Program
-from vgtm_qp.qp.answer import Accuracy, StepSolution
+from vgtm_qp.qp.answer import Accuracy, Move, StepSolution
 from vgtm_qp.qp.daqp import DAQP
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.numbers import ClearanceRows
@@ -63,6 +63,14 @@ class Passage(NamedTuple):
     rows: ClearanceRows
 
 
+class Begun(NamedTuple):
+    """A step that needs further QPs: where the first one led, its rows, and the reach of pairs, m, in it."""
+
+    move: Move
+    rows: ClearanceRows
+    reach: float
+
+
 def can_drive(setup: Setup) -> bool:
     """Return whether usual steps of an arm can be taken in one call; then its bodies are spanned by its nodes."""
     arm, layout = setup.arm, setup.layout
@@ -96,10 +104,10 @@ class Driver:
         self.spent = np.zeros(len(PHASES))
         self._started = self._is_placed = False
 
-    def take(self, state: State, target: Target, share: float) -> Passage | None:
+    def take(self, state: State, target: Target, share: float) -> Passage | Begun | None:
         """Return the step from `state`, in which no pair is too near, to the end of the target's piece of path.
 
-        The motion of the step before, times `share`, predicts this one. None if the step is no usual one.
+        The motion of the step before, times `share`, predicts this one. None if nothing is known of the step.
         """
         setup, work = self._setup, self._work
         if (
@@ -134,6 +142,9 @@ class Driver:
                 assert watch is not None
                 data.way, has_moved = watch.move_to(state.nodes, data.limit, data.self_limit).address, True
                 code = self._take()
+            elif code in (Code.UNSETTLED, Code.NOT_PROVEN):
+                move = self._solver.led(state.torsion, is_settled=code == Code.NOT_PROVEN)
+                return Begun(move, self._rows(), data.reach)
             else:
                 return None
         if data.asked_for:
