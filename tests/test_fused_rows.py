@@ -10,8 +10,11 @@ import pytest
 from arms import TRUSSES, make_layout
 from steps import SHAPES, make_step, shaped
 
+from vgtm_qp.compiled import compiler
+from vgtm_qp.native import Code, building
 from vgtm_qp.problem.method import Weights
-from vgtm_qp.qp.fused_rows import row_function
+from vgtm_qp.qp.fused import FusedSolver
+from vgtm_qp.qp.fused_rows import RESULTS
 from vgtm_qp.qp.linearise import Linearisation
 from vgtm_qp.rows.curve import free_basis
 from vgtm_qp.step.target import QPInput
@@ -21,9 +24,7 @@ TRACKS = [("position",), ("y",), ("x", "z"), ("z", "orientation"), ("orientation
 CURVES = ["tables", "none", "hard", "hard turns", *SHAPES, "hard torsion", "drawn"]
 
 
-@pytest.fixture(autouse=True)
-def _without_a_compiler(monkeypatch):
-    monkeypatch.setenv("VGTM_CC", "none")
+pytestmark = pytest.mark.skipif(compiler() is None, reason="no C compiler")
 
 
 def curved(truss, track, curve="tables", family="bezier", weights=None):
@@ -52,27 +53,31 @@ def asked_at_random(layout, seed, *, base, progress, motion):
 
 def compare(layout, seeds=range(1)):
     """Compare both forms of the QP with the equations."""
-    linearisation, kernel = Linearisation(layout, compiled=False), row_function(layout).kernel(compiled=False)
+    assert building().finish() is not None
+    linearisation, solver = Linearisation(layout, compiled=False), FusedSolver(layout, compiled=False)
+    assert solver.is_ready
     for seed in seeds:
         for motion, progress, base in ((True, 0.0, False), (True, 0.3, True), (False, 0.7, True)):
             asked, rows = asked_at_random(layout, seed, base=base, progress=progress, motion=motion)
             given = oracle.numbers(layout, asked)
             oracle.check_numbers(linearisation.numbers(asked, rows), given, layout, 1e-11)
             wanted = oracle.condensed(layout, asked, given)
-            asked.load(kernel)
-            kernel()
-            stack, tip, *rest, legs, least = (output.copy() for output in kernel.outputs)
+            solver.load(asked)
+            work = solver.workspace
+            assert work.call("assemble") is Code.DONE
+            results = dict(zip(RESULTS, (output.copy() for output in work.condense.outputs), strict=False))
+            legs, least = results["leg_rows"], results["leg_lower"]
             numbers = linearisation.numbers(asked, rows)
-            basis = free_basis(rest[-1], 3 * layout.vertices + layout.torsion)
+            basis = free_basis(results["normal"], 3 * layout.vertices + layout.torsion)
             of_legs = np.pad(numbers.legs.over_vertices(layout), ((0, 0), (0, layout.torsion)))
             np.testing.assert_allclose(
                 legs.reshape(len(least), layout.free_curve), of_legs @ basis, atol=1e-12
             )
             np.testing.assert_allclose(least, numbers.legs.lower, atol=1e-12)
-            size = len(wanted["gradient"])
-            found = {"rows": stack.reshape(size, -1).T, "tip": tip.reshape(-1, size)}
-            names = "lower", "upper", "gradient", "curvature", "offset", "normal"
-            found |= dict(zip(names, rest, strict=True))
+            tips, bounds = len(layout.tip_rows), work.size + len(layout.tip_rows)
+            found = {name: results[name] for name in ("curvature", "offset", "normal")}
+            found |= {"rows": work.stack.T, "tip": work.constraint[:tips], "gradient": results["linear"]}
+            found |= {"lower": work.lower[:bounds], "upper": work.upper[:bounds]}
             # A response is as large as the pose is near to a singular one.
             scale = 1.0 + float(np.abs(wanted["rows"]).max())
             for name, value in wanted.items():
@@ -115,8 +120,7 @@ def test_every_weight_counts_where_it_should(rng):
 
 
 @pytest.mark.parametrize("compiled", [False, True])
-def test_numbers_are_arrays_of_their_own(compiled, monkeypatch):
-    monkeypatch.delenv("VGTM_CC")
+def test_numbers_are_arrays_of_their_own(compiled):
     layout = curved(TRUSSES["octahedral"](), ("position",))
     linearisation = Linearisation(layout, compiled=compiled)
     (first, rows), (second, _) = (

@@ -291,9 +291,6 @@ class JointSpaceSymbols(ArmSymbols):
         jacobian = self._arm.by_quantities(jacobian)
         return [jacobian[rows, self._actuators], ca.vec(moved[:, self._free])]
 
-    def response(self, q: ca.MX, at: ca.MX, moved: ca.MX) -> ca.MX:
-        return ca.horzcat(*self.motion(q, at, moved))
-
     def twists(self, at: ca.MX) -> ca.MX | None:
         """See ``arm.ArmSymbols``; with followers a joint moves nodes by several twists."""
         if self._arm.followers:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -68,6 +68,20 @@ class Frames:
         return rotation, spin
 
 
+class Elimination(NamedTuple):
+    """A stage: its rows, quantities (m,), determine as many coordinates (m,) of free nodes from those before it.
+
+    `row`, `column` and `flat` (E,) are places of the nonzeros: among the stage's rows, the coordinates of all free
+    nodes, and the gradients of ``ArmSymbols.motion``; values in one place add up.
+    """
+
+    rows: Index
+    coordinates: Index
+    row: Index
+    column: Index
+    flat: Index
+
+
 class ArmSymbols(ABC):
     """An arm in CasADi's symbols: functions of a configuration of :attr:`shape`.
 
@@ -81,7 +95,7 @@ class ArmSymbols(ABC):
     given : list of int
         Nodes whose displacement with the base is given; the others follow by the fixed quantities.
     can_eliminate : bool
-        Whether coordinates can be eliminated in order, by :meth:`response` and :meth:`closed`.
+        Whether coordinates can be eliminated in order, by :meth:`elimination` and :meth:`closed`.
     """
 
     shape: tuple[int, int]
@@ -108,9 +122,9 @@ class ArmSymbols(ABC):
     def motion(self, q: Any, at: Any, moved: Any) -> list[Any]:
         """Return what ``Arm.motion_rows`` takes: rows at `at`, residuals at `q`, base moving by `moved` (3, N)."""
 
-    @abstractmethod
-    def response(self, q: Any, at: Any, moved: Any) -> Any:
-        """Return [K, r] (3 (N - N_c), n_a + 1) with K at `at` and r from the residuals at `q`."""
+    def elimination(self) -> Sequence[Elimination]:
+        """Return the stages in which K and r follow from :meth:`motion`; empty where these are its results."""
+        return ()
 
     def twists(self, at: Any) -> Any:  # noqa: ARG002
         """Return (6, n_a) twists of the actuators, see ``JointSpaceArm.functions``; None if nodes do not move so."""

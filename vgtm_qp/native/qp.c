@@ -30,16 +30,30 @@ typedef struct {
     int (*other)(void);
     double feasibility;
 
-    /* Where actuators move nodes by twists; null elsewhere. Then the stack has no rows of the nodes, and its entries for
-       the actuators are products of wrenches and twists. */
-    const double *twists;          /* (n_a, 6): turn, and velocity at the origin */
-    const double *free, *known;    /* (N - N_c, 3) free nodes, and their motions with the base */
-    const double *wrenches;        /* (n_e + L, 6): of the rows of the tip, then of the stack */
-    const double *tip_rates;       /* (n_e): the last column of the rows of the tip */
-    const int *movers, *row_movers;    /* (N - N_c), (n_e + L): numbers of actuators, from the first, that move them */
+    /* Results of row_function, by name. */
+    const double *tip_jacobian, *tip_rate, *linear, *curvature, *offset, *normal, *leg_rows, *leg_lower;
+    const double *gaps, *turns, *faces, *bends, *stretches, *moved;
+    /* Its last results: gradients and right-hand sides of the elimination, or K and r; or where actuators move nodes by
+       twists these (n_a, 6), turn and velocity at the origin, and the free nodes. The others are null. */
+    const double *gradients, *rhs, *twists, *free;
+    const int *free_node, *movers;         /* (N - N_c): numbers, and how many actuators, from the first, move each */
+
+    /* The elimination, see arm.symbols.Elimination: stages, where the rows and nonzeros of each begin, and these; the
+       actuator that each quantity is, or -1. No stages: gradients and rhs are K and r. */
+    int stages;
+    const int *stage_rows, *stage_entries, *stage_quantity, *stage_coordinate, *entry_row, *entry_column, *entry_flat;
+    const int *actuator_of;
+    double *response, *blocks;             /* (nodes, 1 + n_a): r and K; and work: two blocks of a stage */
+
+    /* Nodes of the tip; of S tracked stations nodes and weights (S, 3), turns R of each, and weights (S, V) of place and
+       slope of their points on the curve; weights of the rows of gaps, turns and stretches (L), 1 where they are hard.
+       Rows (3 S, D) of the points and of the stretches over a curve that such weights do not describe, else null. */
+    int tip_nodes, stations, turned, spacings;
+    const int *tip_node, *station_node;
+    const double *station_weight, *curve_weight, *curve_slope, *row_weight;
+    const double *point_rows, *stretch_rows;
 
     double *stack;
-    const double *linear, *curvature, *offset, *normal, *leg_rows, *leg_lower;
     const int *hard_at;            /* (H) columns of the stack */
     const double *curve_hessian;   /* (D, D) */
     const double *goal_pull, *goal_weight;     /* (V, 3), (V) of the control vertices' goals */
@@ -47,9 +61,9 @@ typedef struct {
     const int *place, *of;         /* (E): coordinates of q, and those of a motion whose shares change them */
     const double *share;
 
-    const Index *near_nodes;       /* (R, slots) */
-    const double *near_rows;       /* (R, slots, 3) */
-    const double *near_lower;      /* (R) */
+    int *near_nodes;               /* (R, slots) */
+    double *near_rows;             /* (R, slots, 3) */
+    double *near_lower;            /* (R) */
     const int *node_column;        /* (N), -1 for nodes of the base */
 
     double *hessian, *gradient;                /* (n, n), (n) */
@@ -95,20 +109,210 @@ static void cross(const double *a, const double *b, double *c)
     c[2] = a[0] * b[1] - a[1] * b[0];
 }
 
-/* Entries of the stack and of the tip's rows for actuators that move nodes by twists. */
-static void expand(Fused *f)
+/* In place, rows X (m, w) become A^-1 X; A (m, m) is overwritten. Rows are chosen by their largest entry. */
+static void solve_for(double *A, double *X, int m, int w)
 {
-    int n = f->unknowns, count = f->actuators, rows = f->squares;
-    for (int i = 0; i < count; i++)
-        for (int k = 0; k < rows; k++)
-            f->stack[i * rows + k] =
-                i < f->row_movers[f->tips + k] ? dot(f->wrenches + 6 * (f->tips + k), f->twists + 6 * i, 6) : 0.0;
+    for (int j = 0; j < m; j++) {
+        int best = j;
+        for (int i = j + 1; i < m; i++)
+            if (fabs(A[i * m + j]) > fabs(A[best * m + j])) best = i;
+        if (best != j) {
+            for (int k = j; k < m; k++) { double t = A[j * m + k]; A[j * m + k] = A[best * m + k]; A[best * m + k] = t; }
+            for (int k = 0; k < w; k++) { double t = X[j * w + k]; X[j * w + k] = X[best * w + k]; X[best * w + k] = t; }
+        }
+        double pivot = 1.0 / A[j * m + j];
+        for (int i = j + 1; i < m; i++) {
+            double factor = A[i * m + j] * pivot;
+            if (factor == 0.0) continue;
+            for (int k = j + 1; k < m; k++) A[i * m + k] -= factor * A[j * m + k];
+            for (int k = 0; k < w; k++) X[i * w + k] -= factor * X[j * w + k];
+        }
+    }
+    for (int j = m - 1; j >= 0; j--) {
+        double pivot = 1.0 / A[j * m + j];
+        for (int k = 0; k < w; k++) X[j * w + k] *= pivot;
+        for (int i = 0; i < j; i++) {
+            double factor = A[i * m + j];
+            if (factor == 0.0) continue;
+            for (int k = 0; k < w; k++) X[i * w + k] -= factor * X[j * w + k];
+        }
+    }
+}
+
+/* How the free nodes move: r, then K, stage after stage. The blocks of a stage are D (m, m) over its own coordinates, and
+   the right-hand sides (m, 1 + n_a): its actuators' changes less what earlier coordinates contribute. */
+static void respond(Fused *f)
+{
+    int count = f->actuators, w = 1 + count;
+    if (!f->stages) {
+        for (int k = 0; k < f->nodes; k++) {
+            f->response[k * w] = f->rhs[k];
+            for (int i = 0; i < count; i++) f->response[k * w + 1 + i] = f->gradients[i * f->nodes + k];
+        }
+        return;
+    }
+    for (int s = 0; s < f->stages; s++) {
+        int first = f->stage_rows[s], m = f->stage_rows[s + 1] - first;
+        const int *coordinate = f->stage_coordinate + first;
+        double *D = f->blocks, *X = D + m * m;
+        memset(D, 0, sizeof(double) * (m * m + m * w));
+        for (int j = 0; j < m; j++) {
+            int quantity = f->stage_quantity[first + j], actuator = f->actuator_of[quantity];
+            X[j * w] = f->rhs[quantity];
+            if (actuator >= 0) X[j * w + 1 + actuator] = 1.0;
+        }
+        for (int e = f->stage_entries[s]; e < f->stage_entries[s + 1]; e++) {
+            int row = f->entry_row[e], column = f->entry_column[e];
+            double value = f->gradients[f->entry_flat[e]];
+            if (column < 0) {
+                D[row * m - 1 - column] += value;
+                continue;
+            }
+            const double *before = f->response + column * w;
+            for (int k = 0; k < w; k++) X[row * w + k] -= value * before[k];
+        }
+        solve_for(D, X, m, w);
+        for (int j = 0; j < m; j++) memcpy(f->response + coordinate[j] * w, X + j * w, sizeof(double) * w);
+    }
+}
+
+/* Add the products of a `wrench` (6) and the twists of the first actuators to `sum`, and set it to zero. */
+static void add_twisted(const Fused *f, double *wrench, int movers, double *sum)
+{
+    for (int i = 0; i < movers; i++) sum[i] += dot(wrench, f->twists + 6 * i, 6);
+    memset(wrench, 0, sizeof(double) * 6);
+}
+
+/* A row over the displacements of `count` nodes, with three numbers for each in `part`, as one over the actuators: its
+   value (1 + n_a) without their changes, then for each of them. Without `has_base`, nodes of the base do not count. */
+static void row_over(const Fused *f, const double *part, const int *nodes, int count, int has_base, double *sum)
+{
+    int w = 1 + f->actuators, movers = 0;
+    double wrench[6] = {0.0}, moment[3];
+    memset(sum, 0, sizeof(double) * w);
+    for (int j = 0; j < count; j++, part += 3) {
+        int column = f->node_column[nodes[j]];
+        if (part[0] == 0.0 && part[1] == 0.0 && part[2] == 0.0) continue;
+        if (column < 0 || f->twists) {
+            if (column >= 0 || has_base) sum[0] += dot(part, f->moved + 3 * nodes[j], 3);
+            if (column < 0) continue;
+            if (f->movers[column / 3] != movers) {
+                /* Actuators move the nodes so far by their common wrench. */
+                add_twisted(f, wrench, movers, sum + 1);
+                movers = f->movers[column / 3];
+            }
+            cross(f->free + column, part, moment);
+            for (int a = 0; a < 3; a++) {
+                wrench[a] += moment[a];
+                wrench[3 + a] += part[a];
+            }
+            continue;
+        }
+        for (int a = 0; a < 3; a++) {
+            const double *moved = f->response + (column + a) * w;
+            for (int k = 0; k < w; k++) sum[k] += part[a] * moved[k];
+        }
+    }
+    if (f->twists) add_twisted(f, wrench, movers, sum + 1);
+}
+
+/* Row k of the stack: `sum` over the actuators, `curve` (q) over the free coordinates of the curve, a constant; all times
+   the row's weight. */
+static void stack_row(Fused *f, int k, const double *sum, const double *curve, double constant)
+{
+    int count = f->actuators, rows = f->squares, free = f->unknowns - 1 - count;
+    double weight = f->row_weight[k], *to = f->stack + (f->twists ? 0 : f->nodes) + k;
+    for (int i = 0; i < count; i++) to[i * rows] = weight * sum[1 + i];
+    for (int i = 0; i < free; i++) to[(count + i) * rows] = weight * curve[i];
+    to[(count + free) * rows] = weight * (constant + sum[0]);
+}
+
+/* A row (D) over all coordinates of the curve as one over the free ones, to `curve`; return its value for the offset. */
+static double free_row(const Fused *f, const double *row, double *curve)
+{
+    int free = f->unknowns - 1 - f->actuators;
+    curve[0] = dot(row + 3, f->normal, 3);
+    memcpy(curve + 1, row + 6, sizeof(double) * (free - 1));
+    return dot(row, f->offset, 3 * f->vertices);
+}
+
+/* The same for the row that draws a point of the curve, the sum of its vertices times the weights (V), along `axis`. */
+static double point_row(const Fused *f, const double *weight, const double *axis, double *curve)
+{
+    double known = 0.0;
+    for (int v = 0; v < f->vertices; v++) {
+        known += weight[v] * dot(f->offset + 3 * v, axis, 3);
+        for (int a = 0; a < 3 && v > 1; a++) curve[1 + 3 * (v - 2) + a] = weight[v] * axis[a];
+    }
+    curve[0] = weight[1] * dot(axis, f->normal, 3);
+    return known;
+}
+
+/* The rows of the stations: (32)-(39) over actuators and curve. */
+static void track(Fused *f)
+{
+    int size = 3 * f->vertices + f->torsion, turns = f->turned, S = f->stations;
+    double *sum = f->work, *curve = sum + 1 + f->actuators, *row = curve + size, part[9], axis[3];
+    memset(curve, 0, sizeof(double) * size);
+    for (int s = 0; s < S; s++) {
+        const int *nodes = f->station_node + 3 * s;
+        for (int a = 0; a < 3; a++) {
+            double known;
+            for (int j = 0; j < 9; j++) part[j] = j % 3 == a ? f->station_weight[3 * s + j / 3] : 0.0;
+            row_over(f, part, nodes, 3, 1, sum);
+            for (int b = 0; b < 3; b++) axis[b] = b == a ? -1.0 : 0.0;
+            if (f->point_rows) {
+                for (int d = 0; d < size; d++) row[d] = -f->point_rows[(3 * s + a) * size + d];
+                known = free_row(f, row, curve);
+            } else known = point_row(f, f->curve_weight + s * f->vertices, axis, curve);
+            stack_row(f, 3 * s + a, sum, curve, f->gaps[3 * s + a] + known);
+        }
+        for (int r = 0; r < turns; r++) {
+            double known;
+            for (int j = 0; j < 9; j++) part[j] = f->faces[(9 * s + j) * turns + r];
+            row_over(f, part, nodes, 3, 1, sum);
+            if (f->point_rows) {
+                for (int d = 0; d < size; d++) row[d] = f->bends[(s * size + d) * turns + r];
+                known = free_row(f, row, curve);
+            } else {
+                for (int b = 0; b < 3; b++) axis[b] = f->bends[(3 * s + b) * turns + r];
+                known = point_row(f, f->curve_slope + s * f->vertices, axis, curve);
+            }
+            stack_row(f, 3 * S + turns * s + r, sum, curve, f->turns[turns * s + r] + known);
+        }
+    }
+    memset(sum, 0, sizeof(double) * (1 + f->actuators));
+    for (int k = 0; k < f->spacings; k++) {
+        double known = free_row(f, f->stretch_rows + k * size, curve);
+        stack_row(f, (3 + turns) * S + k, sum, curve, f->stretches[k] + known);
+    }
+}
+
+/* The stack of the least-squares rows, and the rows of the tip with their bounds, from the results of row_function. */
+static void compose(Fused *f)
+{
+    int n = f->unknowns, count = f->actuators, last = n - 1, w = 1 + count, rows = f->squares;
+    if (!f->twists) {
+        double weight = 1.0 / f->scale;
+        respond(f);
+        for (int k = 0; k < f->nodes; k++) {
+            for (int i = 0; i < count; i++) f->stack[i * rows + k] = weight * f->response[k * w + 1 + i];
+            for (int i = count; i < last; i++) f->stack[i * rows + k] = 0.0;
+            f->stack[last * rows + k] = weight * f->response[k * w];
+        }
+    }
+    double *sum = f->work, *part = sum + w;
     for (int k = 0; k < f->tips; k++) {
         double *row = f->constraint + k * n;
+        for (int j = 0; j < 3 * f->tip_nodes; j++) part[j] = f->tip_jacobian[j * f->tips + k];
+        row_over(f, part, f->tip_node, f->tip_nodes, 1, sum);
         memset(row, 0, sizeof(double) * n);
-        for (int i = 0; i < f->row_movers[k]; i++) row[i] = dot(f->wrenches + 6 * k, f->twists + 6 * i, 6);
-        row[n - 1] = f->tip_rates[k];
+        memcpy(row, sum + 1, sizeof(double) * count);
+        row[last] = -f->tip_rate[k];
+        f->lower[n + k] -= sum[0];
+        f->upper[n + k] -= sum[0];
     }
+    if (f->vertices) track(f);
 }
 
 /* Hessian and gradient of the node rate where actuators move nodes by twists. An actuator moves the nodes of those
@@ -119,7 +323,7 @@ static void node_rate(Fused *f)
     double *sums = f->work, weight = 1.0 / (f->scale * f->scale), moment[3];
     memset(sums, 0, sizeof(double) * SUMS * (count + 1));
     for (int k = 0; k < f->nodes / 3; k++) {
-        const double *x = f->free + 3 * k, *known = f->known + 3 * k;
+        const double *x = f->free + 3 * k, *known = f->moved + 3 * f->free_node[k];
         double *s = sums + SUMS * f->movers[k];
         s[0] += 1.0;
         cross(x, known, moment);
@@ -195,7 +399,7 @@ static void objective(Fused *f)
     }
 }
 
-/* Rows after those of the tip, which `condense` wrote in place: stations, legs, clearances. */
+/* Rows after those of the tip: stations, legs, clearances. */
 static void constrain(Fused *f)
 {
     int n = f->unknowns, count = f->actuators, last = n - 1;
@@ -211,27 +415,12 @@ static void constrain(Fused *f)
         memcpy(row + count, f->leg_rows + k * (last - count), sizeof(double) * (last - count));
         *lower = f->leg_lower[k];
     }
+    double *sum = f->work;
     for (int k = 0; k < f->near; k++, row += n, lower++) {
-        const Index *nodes = f->near_nodes + k * f->slots;
-        const double *parts = f->near_rows + 3 * k * f->slots;
-        double known = 0.0;
-        memset(row, 0, sizeof(double) * n);
-        for (int s = 0; s < f->slots; s++) {
-            int column = f->node_column[nodes[s]];
-            const double *part = parts + 3 * s;
-            if (column < 0 || (part[0] == 0.0 && part[1] == 0.0 && part[2] == 0.0)) continue;
-            if (f->twists) {
-                double wrench[6] = {0.0, 0.0, 0.0, part[0], part[1], part[2]};
-                cross(f->free + column, part, wrench);
-                for (int i = 0; i < f->movers[column / 3]; i++) row[i] += dot(wrench, f->twists + 6 * i, 6);
-                known += dot(part, f->known + column, 3);
-                continue;
-            }
-            for (int i = 0; i < count; i++)
-                row[i] += f->scale * dot(part, f->stack + i * f->squares + column, 3);
-            known += f->scale * dot(part, f->stack + last * f->squares + column, 3);
-        }
-        *lower = f->near_lower[k] - known;
+        row_over(f, f->near_rows + 3 * k * f->slots, f->near_nodes + k * f->slots, f->slots, 0, sum);
+        memset(row + count, 0, sizeof(double) * (n - count));
+        memcpy(row, sum + 1, sizeof(double) * count);
+        *lower = f->near_lower[k] - sum[0];
     }
 }
 
@@ -261,10 +450,10 @@ static void residuals(Fused *f, int rows)
 }
 
 /* Condense the QP, but for its rows of clearance, at the state that was loaded. */
-static int assemble(Fused *f)
+EXPORT int assemble(Fused *f)
 {
     if (call(&f->condense)) return NO_VALUE;
-    if (f->twists) expand(f);
+    compose(f);
     objective(f);
     return DONE;
 }
@@ -316,7 +505,7 @@ static double furthest_by_twists(Fused *f, const double *x, int whole)
         const double *of = twist + 6 * f->movers[k / 3];
         cross(of, f->free + k, turned);
         for (int a = 0; a < 3; a++) {
-            double moved = fabs(turned[a] + of[3 + a] + (whole ? f->known[k + a] : 0.0));
+            double moved = fabs(turned[a] + of[3 + a] + (whole ? f->moved[3 * f->free_node[k / 3] + a] : 0.0));
             if (moved > furthest || moved != moved) furthest = moved;
         }
     }
@@ -326,17 +515,14 @@ static double furthest_by_twists(Fused *f, const double *x, int whole)
 /* Move q and the curve by the changes x of the unknowns; `whole` adds the motions by residuals. */
 static void advance(Fused *f, const double *x, int whole)
 {
-    int count = f->actuators, last = f->unknowns - 1;
+    int count = f->actuators;
     double *moved = f->work;
     if (f->twists) f->furthest = furthest_by_twists(f, x, whole);
     else {
-        memset(moved, 0, sizeof(double) * f->nodes);
-        if (whole) memcpy(moved, f->stack + last * f->squares, sizeof(double) * f->nodes);
-        for (int i = 0; i < count; i++)
-            for (int k = 0; k < f->nodes; k++) moved[k] += x[i] * f->stack[i * f->squares + k];
         f->furthest = 0.0;
         for (int k = 0; k < f->nodes; k++) {
-            moved[k] *= f->scale;
+            const double *row = f->response + k * (1 + count);
+            moved[k] = dot(row + 1, x, count) + (whole ? row[0] : 0.0);
             /* NaN stays. */
             if (fabs(moved[k]) > f->furthest || moved[k] != moved[k]) f->furthest = fabs(moved[k]);
         }

@@ -94,12 +94,12 @@ static void clearance_row(StepData *s, int k)
     const double *contact = s->contacts + CONTACT * k, *normal = contact + NORMAL;
     const Pairs *p = s->way->group[s->group[k]];
     for (int i = 0; i < 4; i++) {
-        ((Index *)f->near_nodes)[4 * k + i] = p->points[4 * s->pair[k] + i];
-        for (int a = 0; a < 3; a++) ((double *)f->near_rows)[12 * k + 3 * i + a] = contact[1 + i] * normal[a];
+        f->near_nodes[4 * k + i] = p->points[4 * s->pair[k] + i];
+        for (int a = 0; a < 3; a++) f->near_rows[12 * k + 3 * i + a] = contact[1 + i] * normal[a];
     }
     double lower = (p->is_self ? s->self_safe : s->safe) + s->margin - contact[0];
     lower = fmin(lower, 2.0 * s->margin);
-    ((double *)f->near_lower)[k] = fmax(lower, fmin(s->share_of_way * lower, -s->least_way));
+    f->near_lower[k] = fmax(lower, fmin(s->share_of_way * lower, -s->least_way));
 }
 
 /* The rows of all contacts nearer than the limits. */

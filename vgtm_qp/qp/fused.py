@@ -23,7 +23,7 @@ from vgtm_qp.native import Code, Program, building
 from vgtm_qp.qp.answer import Accuracy, Closed, CurvePoint, Move, Settled, StepSolution
 from vgtm_qp.qp.daqp import DAQP
 from vgtm_qp.qp.dense import EQUALITY, DenseSolver
-from vgtm_qp.qp.fused_rows import row_function
+from vgtm_qp.qp.fused_rows import RESULTS, row_function
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.linearise import StepInput
 from vgtm_qp.qp.numbers import UNBOUNDED, ClearanceRows
@@ -241,7 +241,9 @@ class FusedWorkspace:
         self.actuators, self.equal = len(arm.actuators), equal
         self.size, self.first_near = self.actuators + layout.free_curve + 1, equal + len(layout.legs)
         self.torsion, self.shape = self.size - 1 - layout.torsion, arm.home_configuration.shape
-        self._movers = _movers(layout) if self.condense.outputs[10:] else None
+        self._by_twists = (
+            arm.symbols(Constants()).twists(ca.MX.sym("q", arm.home_configuration.size)) is not None
+        )
         self._is_ready: bool | None = None
         self._accuracy: Accuracy | None = None
         self._goals: object = None
@@ -334,15 +336,13 @@ class FusedWorkspace:
     def displacement(self, x: Array, constant: float) -> Array:
         """Return (N - N_c, 3) displacements of the free nodes by `x`, and `constant` times the known ones, m."""
         count = self.actuators
-        if self._movers is None:
-            moved = x[:count] @ self._response[:count] + constant * self._response[-1]
-            return np.asarray(moved.reshape(-1, 3) / np.sqrt(self._layout.weights.node_rate))
-        twists, places, known = (
-            values.reshape(-1, size) for values, size in zip(self._bodies, (6, 3, 3), strict=True)
-        )
-        summed = np.concatenate([np.zeros((1, 6)), np.cumsum(x[:count, None] * twists, axis=0)])[
-            self._movers[0]
-        ]
+        if not self._by_twists:
+            moved = self._response[:, 1:] @ x[:count] + constant * self._response[:, 0]
+            return np.asarray(moved.reshape(-1, 3))
+        twists, places = self._moving[0].reshape(-1, 6), self._moving[1].reshape(-1, 3)
+        known = self._moved.reshape(-1, 3)[self._layout.arm.free]
+        summed = np.concatenate([np.zeros((1, 6)), np.cumsum(x[:count, None] * twists, axis=0)])
+        summed = summed[_movers(self._layout)]
         return np.asarray(np.cross(summed[:, :3], places) + summed[:, 3:] + constant * known)
 
     def take(self, clearance: ClearanceRows) -> int:
@@ -362,7 +362,11 @@ class FusedWorkspace:
     def near(self, count: int) -> tuple[Index, Array, Array]:
         """Return nodes (R, 4), coefficients (R, 4, 3) and bounds (R,) of the first rows of clearance."""
         nodes, rows = self._near_nodes[: 4 * count], self._near_rows[: 12 * count]
-        return nodes.reshape(-1, 4).copy(), rows.reshape(-1, 4, 3).copy(), self._near_lower[:count].copy()
+        return (
+            nodes.reshape(-1, 4).astype(np.int64),
+            rows.reshape(-1, 4, 3).copy(),
+            self._near_lower[:count].copy(),
+        )
 
     def reserve(self, near: int) -> None:
         """Make room for `near` rows of clearance at least."""
@@ -387,40 +391,31 @@ class FusedWorkspace:
         self.q, self.points, self.gone = missing.inputs[0], missing.inputs[3], missing.inputs[common]
         self.started, self.started_points = self.q.copy(), self.points.copy()
         size, equal, nodes = self.size, self.equal, layout.node_columns
-        rows = layout.least_squares - (0 if self._movers is None else nodes)
+        rows = layout.least_squares - (nodes if self._by_twists else 0)
         self.hessian, self.gradient, self.x = np.zeros((size, size)), np.zeros(size), np.zeros(size)
-        out = condense.outputs
-        self.offset, self.normal = out[6].reshape(-1, 3), out[7]
+        found = dict(zip(RESULTS, condense.outputs, strict=False))
+        self._moving, self._moved = condense.outputs[len(RESULTS) :], found["moved"]
+        self.offset, self.normal = found["offset"].reshape(-1, 3), found["normal"]
+        self._response = np.zeros((nodes, 1 + self.actuators))
+        self.stack = np.zeros((size, rows))
         sums = 16 * (self.actuators + 1)
         work = nodes + sums + size * (rows + size + equal + SETTLING_STEPS + 4) + equal * (equal + 1)
         self._program = Program("Fused")
         self._program.set(**_numbers(layout), **_daqp(), unknowns=size)
-        if self._movers is None:
-            stack, self._response = out[0], out[0].reshape(size, rows)[:, :nodes]
+        # The bounds are written where the QP has them.
+        self._program.set(**{name: array for name, array in found.items() if name not in ("lower", "upper")})
+        self._program.set(**_composition(layout, condense))
+        if self._by_twists:
+            twists, places = self._moving
+            free = layout.arm.free.astype(np.int32)
+            self._program.set(twists=twists, free=places, free_node=free, movers=_movers(layout))
         else:
-            # The kernel writes the columns after those of the actuators, in place.
-            stack = np.zeros(size * rows)
-            condense.bind_output(0, stack[self.actuators * rows :])
-            self._bodies = out[10:13]
-            self._program.set(
-                twists=out[10],
-                free=out[11],
-                known=out[12],
-                wrenches=out[13],
-                tip_rates=out[1],
-                movers=self._movers[0],
-                row_movers=self._movers[1],
-            )
+            gradients, rhs = self._moving
+            self._program.set(gradients=gradients, rhs=rhs, response=self._response, **_elimination(layout))
         self._program.set(
-            stack=stack,
+            stack=self.stack,
             squares=rows,
             hard_at=(rows - (layout.least_squares - nodes) + layout.hard).astype(np.int32),
-            linear=out[4],
-            curvature=out[5],
-            offset=out[6],
-            normal=out[7],
-            leg_rows=out[8],
-            leg_lower=out[9],
             hessian=self.hessian,
             gradient=self.gradient,
             x=self.x,
@@ -450,16 +445,14 @@ class FusedWorkspace:
         size, tips = self.size, len(self._layout.tip_rows)
         self._room, self._slots, rows = near, slots, self.first_near + near
         self.constraint, self.multipliers = np.zeros((rows, size)), np.zeros(size + rows)
-        self._near_nodes = np.zeros(near * slots, dtype=np.int64)
+        self._near_nodes = np.zeros(near * slots, dtype=np.int32)
         self._near_rows, self._near_lower = np.zeros(3 * near * slots), np.zeros(near)
         self.lower, self.upper = np.full(size + rows, -UNBOUNDED), np.full(size + rows, UNBOUNDED)
         self._sense = np.zeros(size + rows, dtype=np.int32)
         self._sense[size : size + self.equal] = EQUALITY
-        # The kernel writes the tip's rows, and the bounds up to these, in place.
-        of_tip = (self.constraint[:tips].reshape(-1), self.lower[: size + tips], self.upper[: size + tips])
-        for result, array in enumerate(of_tip, start=1):
-            if result > 1 or self._movers is None:
-                self.condense.bind_output(result, array)
+        # The kernel writes the bounds up to the tip's rows in place.
+        for name, array in (("lower", self.lower), ("upper", self.upper)):
+            self.condense.bind_output(RESULTS.index(name), array[: size + tips])
         self._program.set(
             near_nodes=self._near_nodes,
             near_rows=self._near_rows,
@@ -506,19 +499,76 @@ def _numbers(layout: Layout) -> dict[str, Any]:
     }
 
 
-def _movers(layout: Layout) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Return how many actuators, from the first, move each free node and each row of tip, gaps, turns and spacings."""
+def _composition(layout: Layout, condense: Kernel) -> dict[str, Any]:
+    """Return by field what the C knows of the rows of tip, stations and curve, with which it composes the QP."""
+    stations, tip, tracked, weights = (
+        layout.arm.stations,
+        layout.arm.end_effector,
+        layout.tracked,
+        layout.weights,
+    )
+    angles = np.array([weights.tangent, weights.tangent, weights.roll])[: layout.turns]
+    gaps = np.where(layout.hard_gaps, 1.0, np.sqrt(weights.tracking))
+    turns = np.where(layout.hard_tilts, 1.0, np.sqrt(angles))
+    spacings = np.full(layout.spacings, np.sqrt(weights.spacing))
+    curve: dict[str, Any] = {
+        "curve_weight": np.ascontiguousarray(layout.curve_weights),
+        "curve_slope": np.ascontiguousarray(layout.curve_slopes),
+    }
+    if layout.general is not None:
+        points, rows = (12 + CurveRows._fields.index(name) for name in ("position_rows", "spacing_rows"))
+        curve = {"point_rows": condense.inputs[points], "stretch_rows": condense.inputs[rows]}
+    return {
+        "tip_nodes": len(tip.nodes),
+        "tip_node": tip.nodes.astype(np.int32),
+        "stations": len(tracked),
+        "turned": layout.turns,
+        "spacings": layout.spacings,
+        "station_node": np.ascontiguousarray(stations.nodes[tracked], dtype=np.int32),
+        "station_weight": np.ascontiguousarray(stations.weights[tracked]),
+        "row_weight": np.concatenate([gaps.reshape(-1), turns.reshape(-1), spacings]),
+        **curve,
+    }
+
+
+def _elimination(layout: Layout) -> dict[str, Any]:
+    """Return by field the elimination of an arm; see ``arm.symbols.Elimination``."""
+    arm, stages = layout.arm, layout.arm.symbols(Constants()).elimination()
+    if not stages:
+        return {"stages": 0}
+    entries, columns = np.cumsum([0, *(len(stage.row) for stage in stages)]), []
+    rows = np.cumsum([0, *(len(stage.rows) for stage in stages)])
+    for stage in stages:
+        # Coordinates of the stage itself are numbered from -1 down.
+        own = np.full(layout.node_columns, -1)
+        own[stage.coordinates] = np.arange(len(stage.coordinates))
+        columns.append(np.where(own[stage.column] >= 0, -1 - own[stage.column], stage.column))
+    actuator_of = np.full(len(arm.quantity_names), -1)
+    actuator_of[arm.actuators] = np.arange(len(arm.actuators))
+    size = max(len(stage.rows) for stage in stages)
+    numbers = {
+        "stage_rows": rows,
+        "stage_entries": entries,
+        "stage_quantity": np.concatenate([stage.rows for stage in stages]),
+        "stage_coordinate": np.concatenate([stage.coordinates for stage in stages]),
+        "entry_row": np.concatenate([stage.row for stage in stages]),
+        "entry_column": np.concatenate(columns),
+        "entry_flat": np.concatenate([stage.flat for stage in stages]),
+        "actuator_of": actuator_of,
+    }
+    return {
+        "stages": len(stages),
+        "blocks": np.zeros(size * (size + 1 + len(arm.actuators))),
+        **{name: array.astype(np.int32) for name, array in numbers.items()},
+    }
+
+
+def _movers(layout: Layout) -> NDArray[np.int32]:
+    """Return (N - N_c,) how many actuators, from the first, move each free node."""
     arm = layout.arm
     assert isinstance(arm, JointSpaceArm)
     moved = np.concatenate([[0], np.cumsum(arm.actuated)])[arm.movers]
-    stations = arm.stations
-    nodes = moved[stations.nodes[layout.tracked]]
-    # An actuator may count that moves none of a row's nodes, as its axis goes through these.
-    gaps = np.where(stations.weights[layout.tracked] != 0.0, nodes, 0).max(axis=1, initial=0)
-    turns = nodes.max(axis=1, initial=0)
-    rows = [np.full(len(layout.tip_rows), moved[arm.end_effector.nodes].max()), np.repeat(gaps, 3)]
-    rows += [np.repeat(turns, layout.turns), np.zeros(layout.spacings)]
-    return moved[arm.free].astype(np.int32), np.concatenate(rows).astype(np.int32)
+    return np.asarray(moved[arm.free], dtype=np.int32)
 
 
 def _places(layout: Layout) -> tuple[NDArray[np.int32], NDArray[np.int32], Array, bool]:

@@ -14,7 +14,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from vgtm_qp.arm.symbols import ArmSymbols, Constants
+from vgtm_qp.arm.symbols import ArmSymbols, Constants, Elimination
 from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.arrays import Index
 from vgtm_qp.rows.members import fixed_error, length_rhs, member_function
@@ -128,29 +128,18 @@ class TrussSymbols(ArmSymbols):
         three = all(int(truss.actuated[stage.members].sum()) == 3 for stage in self._stages)
         return bool(stages) and three and len(stages) == len(tracked) and faces.issuperset(stages)
 
-    def response(self, X: ca.MX, at: ca.MX, moved: ca.MX) -> ca.MX:
-        gradients, rhs = self.motion(X, at, moved)
-        truss = self._truss
-        place: dict[int, ca.MX] = {}
-        count = len(truss.actuators)
-        for stage, (D, L) in zip(self._stages, self._blocks(gradients), strict=True):
-            own = np.flatnonzero(truss.actuated[stage.members])
-            actuators = np.searchsorted(truss.actuators, stage.members[own])
-            earlier, rows = L.size2(), len(stage.members)
-            unit = ca.MX(ca.DM(np.eye(rows)[:, own]))
-            known = ca.horzcat(ca.densify(-L), unit, rhs[stage.members.tolist()])
-            solved = self._solver(D.sparsity(), known.size2())(D, known)
-            columns, particular = ca.MX(rows, count), solved[:, -1]
-            if earlier:
-                before = ca.vertcat(*(place[int(node)] for node in stage.earlier))
-                product = solved[:, :earlier] @ before
-                columns, particular = product[:, :count], product[:, count] + particular
-            if len(own):
-                spread = ca.sparsify(ca.DM(np.eye(count)[actuators]))
-                columns = columns + solved[:, earlier:-1] @ spread
-            block = ca.horzcat(ca.densify(columns), particular)
-            place |= zip(stage.nodes.tolist(), ca.vertsplit(block, 3), strict=True)
-        return ca.vertcat(*(place[int(node)] for node in truss.free))
+    def elimination(self) -> list[Elimination]:
+        """See ``arm.ArmSymbols``: the length Jacobian, stage by stage."""
+        scatter, found = self._truss.scatter, []
+        for stage in self._stages:
+            row = np.full(scatter.shape[0], -1)
+            row[stage.members] = np.arange(len(stage.members))
+            kept = np.flatnonzero(row[scatter.member] >= 0)
+            places = np.array([self._place[node] for node in stage.nodes.tolist()])
+            coordinates = (places[:, None] + np.arange(3)).reshape(-1)
+            entries = row[scatter.member[kept]], scatter.column[kept], scatter.flat[kept]
+            found.append(Elimination(stage.members, coordinates, *entries))
+        return found
 
     def _layers(self, members: Index, nodes: Index) -> _Layers:
         """Return the layers of the block of `members` (rows) and free `nodes` (three columns each)."""
