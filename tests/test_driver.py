@@ -177,3 +177,42 @@ def test_a_state_that_is_not_what_it_is_said_to_be_is_refused(lie, driven, monke
     assert resolver.state is before
     assert driven
     assert not any(driven)
+
+
+@pytest.mark.parametrize(
+    "name", ["five_bay_free", "tetrahedral_past_a_cube", "snake_past_a_cube", "station_arm_past_a_module"]
+)
+def test_what_c_knows_of_an_arm_is_what_the_arm_says(name, rng):
+    arm = vq.Resolver(vq.load_problem(name)).setup.arm
+    known = arm.arithmetic()
+    moves = np.setdiff1d(np.arange(arm.home_configuration.size), known.based)
+    q, then = (arm.home_configuration.copy() for _ in range(2))
+    for configuration, size in ((q, 0.05), (then, 0.06)):
+        configuration.reshape(-1)[moves] += size * rng.normal(size=len(moves))
+    if known.place is None:
+        np.testing.assert_array_equal(arm.nodes(q), q)
+    else:
+        known.place.inputs[0][:] = q
+        known.place()
+        np.testing.assert_allclose(known.place.outputs[0].reshape(-1, 3), arm.nodes(q), atol=1e-14)
+    bound = 0.0
+    if known.bend is not None:
+        known.bend.inputs[0][:], known.bend.inputs[1][:] = q, then
+        known.bend()
+        bound = 0.25 * known.bend.outputs[0][:2].max()
+    assert bound == pytest.approx(arm.deviation(q, then), abs=1e-15)
+    if known.distances:
+        values = np.linalg.norm(q[known.first] - q[known.last], axis=1)
+    else:
+        values = q[known.first] - known.multiplier * q[known.last]
+    np.testing.assert_allclose(values, arm.measured(q), atol=1e-14)
+    moved = np.abs(then - q)
+    travel = moved.max() if known.levers is None else moved @ known.levers
+    assert travel == pytest.approx(arm.travel(then - q))
+
+
+def test_an_arm_with_offset_joints_is_left_to_attempts(driven):
+    resolver = vq.Resolver(vq.load_problem("offset_joints_past_a_cube"))
+    assert resolver.setup.arm.arithmetic() is None
+    assert resolver.step(position=resolver.tip()[0] + 0.01).moved
+    assert not any(driven)

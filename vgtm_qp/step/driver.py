@@ -72,11 +72,11 @@ class Begun(NamedTuple):
 
 
 def can_drive(setup: Setup) -> bool:
-    """Return whether usual steps of an arm can be taken in one call; then its bodies are spanned by its nodes."""
-    arm, layout = setup.arm, setup.layout
+    """Return whether usual steps of an arm can be taken in one call, if its ``Arm.arithmetic`` is known."""
+    layout = setup.layout
     is_plain = layout.general is None and layout.own is None and setup.base_motion is None
     without_limits = setup.minimum_angle == 0.0 and setup.step_limit == np.inf
-    return is_plain and without_limits and arm.arithmetic() is not None
+    return is_plain and without_limits
 
 
 class Driver:
@@ -98,7 +98,7 @@ class Driver:
         self._setup, self._engine, self._accuracy = setup, engine, accuracy
         self._separation = separation
         self._solver, self._layout = engine.solver, engine.layout
-        self._work = self._solver.workspace
+        self._work, self._known = self._solver.workspace, setup.arm.arithmetic()
         self._held: State | None = None
         self._watch: Watch | None = None
         self.spent = np.zeros(len(PHASES))
@@ -282,7 +282,7 @@ class Driver:
             program.set(**{f"next_{name}": self._after[part]})
         self._nodes = self._before[self._parts[1]].reshape(-1, 3)
         self._make_room(_ROOM)
-        known, tip = arm.arithmetic(), arm.end_effector
+        known, tip = self._known, arm.end_effector
         assert known is not None
         self._is_placed = known.place is None
         if known.place is not None:

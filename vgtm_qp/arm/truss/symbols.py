@@ -1,7 +1,7 @@
 """A truss in CasADi's symbols, and the elimination of its bays one after another.
 
 With the square diagonal blocks D and the blocks L towards earlier bays of the length Jacobian, d_rho = K d_a + r
-follows from K = D^-1 (E - L K_earlier).
+follows from K = D^-1 (E - L K_earlier), see ``native/qp.c``.
 """
 
 from __future__ import annotations
@@ -168,11 +168,11 @@ class TrussSymbols(ArmSymbols):
             blocks.append((D, _block(earlier, gradients, stage.members, stage.earlier)))
         return blocks
 
-    def _solver(self, D: ca.Sparsity, width: int) -> ca.Function:
-        """Return (D, right-hand sides (rows, width)) -> D^-1 rhs by an unrolled sparse QR factorisation."""
-        key = (D.size1(), tuple(D.row()), tuple(D.colind()), width)
+    def _solver(self, D: ca.Sparsity) -> ca.Function:
+        """Return (D, right-hand side) -> D^-1 rhs by an unrolled sparse QR factorisation."""
+        key = D.size1(), tuple(D.row()), tuple(D.colind())
         if key not in self._solvers:
-            block, rhs = ca.SX.sym("D", D), ca.SX.sym("rhs", D.size1(), width)
+            block, rhs = ca.SX.sym("D", D), ca.SX.sym("rhs", D.size1())
             orthogonal, triangular = ca.qr(block)
             solved = ca.densify(ca.solve(triangular, orthogonal.T @ rhs))
             self._solvers[key] = ca.Function(f"bay{len(self._solvers)}", [block, rhs], [solved])
@@ -184,7 +184,7 @@ class TrussSymbols(ArmSymbols):
         for stage, (D, L), right in zip(self._stages, blocks, rhs, strict=True):
             if len(stage.earlier):
                 right = right - L @ ca.vertcat(*(place[int(node)] for node in stage.earlier))
-            step = self._solver(D.sparsity(), 1)(D, right)
+            step = self._solver(D.sparsity())(D, right)
             place |= zip(stage.nodes.tolist(), ca.vertsplit(step, 3), strict=True)
         zero = ca.DM.zeros(3)
         return ca.horzcat(*(place.get(node, zero) for node in range(self._truss.node_count)))
