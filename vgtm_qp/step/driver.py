@@ -111,7 +111,8 @@ class Driver:
         """
         setup, work = self._setup, self._work
         if (
-            not work.is_ready
+            self._known is None
+            or not work.is_ready
             or setup.carrier.carried
             or not target.path.is_straight(target.start, target.end)
         ):
