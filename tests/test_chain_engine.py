@@ -172,7 +172,7 @@ def test_the_rows_of_a_period_are_derivatives(name, reverse, rng):
 
 @pytest.mark.parametrize("tracking", ["elastic", "hard"])
 def test_whole_maneuvers_are_the_same(tracking, monkeypatch):
-    (scene,) = make_scenes(["cubes"], [20], [tracking])
+    (scene,) = make_scenes(["cubes"], [24], [tracking])
     ends = []
     for plain in (False, True):
         if plain:

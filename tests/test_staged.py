@@ -471,10 +471,10 @@ def test_long_regular_arms_are_solved_along_the_chain():
     short = Case(modules.octahedral(5)).layout
     assert not prefers_staged(short)
     assert isinstance(make_solver("daqp", short), CondensedSolver)
-    long = Case(modules.octahedral(20)).layout
+    long = Case(modules.octahedral(24)).layout
     assert prefers_staged(long)
     assert isinstance(make_solver("daqp", long), StagedSolver)
-    hard = Case(modules.octahedral(20), hard_tracking=True).layout
+    hard = Case(modules.octahedral(24), hard_tracking=True).layout
     assert isinstance(make_solver("daqp", hard), TrackedSolver)
     legs = Case(modules.hexapod(10), hard_tracking=True).layout
     assert chain_solver(legs) is None

@@ -175,6 +175,10 @@ class JointSpaceArm(Arm):
         """Return ``Arithmetic.bend``."""
 
     @cached_property
+    def _bend(self) -> Kernel:
+        return self.bending()
+
+    @cached_property
     def _known_nodes(self) -> dict[bytes, Array]:
         """The nodes of the last configurations."""
         return {}

@@ -68,7 +68,7 @@ class Frames:
         return rotation, spin
 
 
-class Elimination(NamedTuple):
+class EliminationStage(NamedTuple):
     """A stage: its rows, quantities (m,), determine as many coordinates (m,) of free nodes from those before it.
 
     `row`, `column` and `flat` (E,) are places of the nonzeros: among the stage's rows, the coordinates of all free
@@ -122,7 +122,7 @@ class ArmSymbols(ABC):
     def motion(self, q: Any, at: Any, moved: Any) -> list[Any]:
         """Return what ``Arm.motion_rows`` takes: rows at `at`, residuals at `q`, base moving by `moved` (3, N)."""
 
-    def elimination(self) -> Sequence[Elimination]:
+    def elimination(self) -> Sequence[EliminationStage]:
         """Return the stages in which K and r follow from :meth:`motion`; empty where these are its results."""
         return ()
 

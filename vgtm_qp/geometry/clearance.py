@@ -87,12 +87,6 @@ class Clearance:
         return self.scene.pieces
 
     @property
-    def has_pairs(self) -> bool:
-        """Whether two bodies, or a body and an obstacle, can ever be near."""
-        count = len(self.bodies)
-        return bool(count and len(self.pieces)) or (self.self_collision and count > 1)
-
-    @property
     def names(self) -> PairNames:
         """Names of the pairs."""
         return self.scene.names

@@ -88,6 +88,12 @@ class Scene:
             for shape in self.shapes:
                 self.batch(make, shape)
 
+    @property
+    def has_pairs(self) -> bool:
+        """Whether two bodies, or a body and an obstacle, can ever be near."""
+        count = len(self.bodies)
+        return bool(count and len(self.pieces)) or (self.has_self and count > 1)
+
     def contacts(self, parts: Sequence[Found]) -> Contacts:
         """Return the contacts of all `parts`, one part after the other."""
         if not parts:

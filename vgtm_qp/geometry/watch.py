@@ -26,7 +26,7 @@ from vgtm_qp.geometry.pairs import Contacts, Wanted
 from vgtm_qp.geometry.shapes import GeometryError
 from vgtm_qp.native import Code, Program, building
 
-_MOST_PAIRS = 8000
+_MOST_PAIRS = 20_000
 """Greatest number of pairs of a scene that can be watched."""
 
 AHEAD = 1.2

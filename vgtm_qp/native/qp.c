@@ -38,7 +38,7 @@ typedef struct {
     const double *gradients, *rhs, *twists, *free;
     const int *free_node, *movers;         /* (N - N_c): numbers, and how many actuators, from the first, move each */
 
-    /* The elimination, see arm.symbols.Elimination: stages, where the rows and nonzeros of each begin, and these; the
+    /* The elimination, see arm.symbols.EliminationStage: stages, where the rows and nonzeros of each begin, and these; the
        actuator that each quantity is, or -1. No stages: gradients and rhs are K and r. */
     int stages;
     const int *stage_rows, *stage_entries, *stage_quantity, *stage_coordinate, *entry_row, *entry_column, *entry_flat;
@@ -53,8 +53,9 @@ typedef struct {
     const double *station_weight, *curve_weight, *curve_slope, *row_weight;
     const double *point_rows, *stretch_rows;
 
-    double *stack;
-    const int *hard_at;            /* (H) columns of the stack */
+    double *stack;                         /* (n, L), the last for the constant */
+    const int *first_row;                  /* (n) the first row in which each column can have entries */
+    const int *hard_at;                    /* (H) rows that are equalities */
     const double *curve_hessian;   /* (D, D) */
     const double *goal_pull, *goal_weight;     /* (V, 3), (V) of the control vertices' goals */
     int places;
@@ -371,7 +372,8 @@ static void objective(Fused *f)
     for (int i = 0; i < n; i++) {
         int to = i < last ? i + 1 : last;
         for (int j = 0; j < to; j++) {
-            double sum = dot(free_rows + i * rows, free_rows + j * rows, rows);
+            int from = f->first_row[i] > f->first_row[j] ? f->first_row[i] : f->first_row[j];
+            double sum = dot(free_rows + i * rows + from, free_rows + j * rows + from, rows - from);
             if (i < last) H[j * n + i] = H[i * n + j] += sum;
             else g[j] += sum + f->linear[j];
         }

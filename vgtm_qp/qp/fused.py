@@ -414,6 +414,7 @@ class FusedWorkspace:
             self._program.set(gradients=gradients, rhs=rhs, response=self._response, **_elimination(layout))
         self._program.set(
             stack=self.stack,
+            first_row=_first_rows(layout, size),
             squares=rows,
             hard_at=(rows - (layout.least_squares - nodes) + layout.hard).astype(np.int32),
             hessian=self.hessian,
@@ -532,7 +533,7 @@ def _composition(layout: Layout, condense: Kernel) -> dict[str, Any]:
 
 
 def _elimination(layout: Layout) -> dict[str, Any]:
-    """Return by field the elimination of an arm; see ``arm.symbols.Elimination``."""
+    """Return by field the elimination of an arm; see ``arm.symbols.EliminationStage``."""
     arm, stages = layout.arm, layout.arm.symbols(Constants()).elimination()
     if not stages:
         return {"stages": 0}
@@ -561,6 +562,20 @@ def _elimination(layout: Layout) -> dict[str, Any]:
         "blocks": np.zeros(size * (size + 1 + len(arm.actuators))),
         **{name: array.astype(np.int32) for name, array in numbers.items()},
     }
+
+
+def _first_rows(layout: Layout, size: int) -> NDArray[np.int32]:
+    """Return (n,) the first least-squares row that each unknown can change; actuators move what is placed with them."""
+    arm, first = layout.arm, np.zeros(size, dtype=np.int32)
+    stages = arm.symbols(Constants()).elimination()
+    if not stages:
+        return first
+    count = len(arm.actuators)
+    begins = np.minimum.accumulate([stage.coordinates.min() for stage in stages][::-1])[::-1]
+    for stage, begin in zip(stages, begins, strict=True):
+        first[:count][np.isin(arm.actuators, stage.rows)] = begin
+    first[count:-1] = layout.node_columns
+    return first
 
 
 def _movers(layout: Layout) -> NDArray[np.int32]:

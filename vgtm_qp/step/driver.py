@@ -119,7 +119,7 @@ class Driver:
             return None
         monitor = setup.monitor
         watch = self._watch = monitor.watching()
-        if watch is None and monitor.has_pairs:
+        if watch is None and monitor.scene.has_pairs:
             return None
         if not self._started:
             self._start()

@@ -237,9 +237,8 @@ class Resolver(ChangingScene):
         if (known := self.state.tip) is not None:
             return known.position.copy(), known.rotation.copy()
         with self._lock:
-            kinematics, nodes = self.setup.kinematics, self.state.nodes
-            kinematics.evaluate_tip(nodes)
-            return self.setup.arm.end_effector.position(nodes), kinematics.tip_rotation.copy()
+            self.setup.kinematics.evaluate_tip(nodes := self.state.nodes)
+            return self.setup.arm.end_effector.position(nodes), self.setup.kinematics.tip_rotation.copy()
 
     def follow(self, path: Path, start: float, end: float, *, dt: float | None = None) -> Step:
         """Move along `path` from its value `start` towards `end` in one step of `dt`, s, by default the problem's.

@@ -158,10 +158,6 @@ class SerialArm(JointSpaceArm):
     def bending(self) -> Kernel:
         return bend_function(self.chain).kernel()
 
-    @cached_property
-    def _bend(self) -> Kernel:
-        return self.bending()
-
     def approach(self, motion: Array) -> Approach:
         """See ``arm.Arm``.
 

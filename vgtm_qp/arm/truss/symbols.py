@@ -14,7 +14,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from vgtm_qp.arm.symbols import ArmSymbols, Constants, Elimination
+from vgtm_qp.arm.symbols import ArmSymbols, Constants, EliminationStage
 from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.arrays import Index
 from vgtm_qp.rows.members import fixed_error, length_rhs, member_function
@@ -128,7 +128,7 @@ class TrussSymbols(ArmSymbols):
         three = all(int(truss.actuated[stage.members].sum()) == 3 for stage in self._stages)
         return bool(stages) and three and len(stages) == len(tracked) and faces.issuperset(stages)
 
-    def elimination(self) -> list[Elimination]:
+    def elimination(self) -> list[EliminationStage]:
         """See ``arm.ArmSymbols``: the length Jacobian, stage by stage."""
         scatter, found = self._truss.scatter, []
         for stage in self._stages:
@@ -138,7 +138,7 @@ class TrussSymbols(ArmSymbols):
             places = np.array([self._place[node] for node in stage.nodes.tolist()])
             coordinates = (places[:, None] + np.arange(3)).reshape(-1)
             entries = row[scatter.member[kept]], scatter.column[kept], scatter.flat[kept]
-            found.append(Elimination(stage.members, coordinates, *entries))
+            found.append(EliminationStage(stage.members, coordinates, *entries))
         return found
 
     def _layers(self, members: Index, nodes: Index) -> _Layers:
