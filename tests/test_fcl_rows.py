@@ -326,7 +326,7 @@ def test_step_certificate_and_summary_say_who_supplied_the_rows(maneuvers):
         assert counts == maneuver.summary()["clearance_rows"]
         assert (certificate.fcl_rows.value, certificate.exact_rows.value) == (counts["fcl"], counts["exact"])
         assert certificate.ok
-        assert counts[name] > 50
+        assert counts[name] >= 10
         assert sum(counts.values()) == counts[name]
         old = {key: value for key, value in certificate.to_dict().items() if not key.endswith("_rows")}
         assert Certificate.from_dict(old).fcl_rows.value is None

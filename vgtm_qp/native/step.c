@@ -23,16 +23,13 @@ typedef struct {
     const double *multiplier, *home;       /* (M) */
     const double *levers;                  /* (coordinates) bounds of how far a node moves per change of each; or null */
     const double *tip_weight;              /* (K) of the tip's nodes */
-    const int *tip_node;
-    int tip_nodes, turns;                  /* coordinates of the tip's turn that are tracked: 0, 2 for its z-axis, or 3 */
+    int turns;                             /* coordinates of the tip's turn that are tracked: 0, 2 for its z-axis, or 3 */
     double unit;                           /* of the arm, m: by which angles become lengths */
 
-    /* The curve: tracked stations S with their nodes and weights (S, 3), weights (S, V) of their places on it; weights and
-       slopes (V) of its end, and the gain (V, 1 or 2) from the errors of place and slope there. */
-    int stations, ends_at_tip, ends_along_tip, must_track;
-    const int *station_node;
-    const double *station_weight, *curve_weight, *curve_slope, *end_gain;
-    const double *normal;                  /* (3) of the base */
+    /* Whether the curve ends at the tip, and along its z-axis, and whether stations must be on it; the gain (V, 1 or 2)
+       from the errors of place and slope at its end; the base's normal (3). */
+    int ends_at_tip, ends_along_tip, must_track;
+    const double *end_gain, *base_normal;
 
     /* Clearances, the margin of their rows, the distance of pairs that are far, share and least of a pair's approach;
        rounding of a distance. */
@@ -226,8 +223,8 @@ static double turn_missing(StepData *s)
 {
     const Fused *f = s->fused;
     double spin[3], turning[9], goal[9], w[3] = {0.0, 0.0, 0.0}, cosine = 0.0;
-    for (int k = 0; k < s->tip_nodes; k++)
-        memcpy((double *)s->frame.arg[0] + 3 * k, s->next_nodes + 3 * s->tip_node[k], sizeof(double) * 3);
+    for (int k = 0; k < f->tip_nodes; k++)
+        memcpy((double *)s->frame.arg[0] + 3 * k, s->next_nodes + 3 * f->tip_node[k], sizeof(double) * 3);
     if (call(&s->frame)) return NAN;
     const double *tip = s->frame.res[0];
     for (int a = 0; a < 3; a++) spin[a] = *f->gone * f->spin[a];
@@ -268,7 +265,7 @@ static int is_flawless(StepData *s)
     }
     for (int i = 0; i < s->axes; i++) {
         double error = f->condense.arg[8][s->axis[i]] + *f->gone * f->velocity[s->axis[i]];
-        for (int k = 0; k < s->tip_nodes; k++) error -= s->tip_weight[k] * x[3 * s->tip_node[k] + s->axis[i]];
+        for (int k = 0; k < f->tip_nodes; k++) error -= s->tip_weight[k] * x[3 * f->tip_node[k] + s->axis[i]];
         off += error * error;
     }
     if (s->turns) {
@@ -289,11 +286,12 @@ static void end_curve(StepData *s)
     memcpy(s->next_vertices, points, sizeof(double) * 3 * f->vertices);
     if (!s->ends_at_tip) return;
     memcpy(missing, position, sizeof(double) * 3);
-    const double *weight = s->curve_weight + (s->stations - 1) * f->vertices;
+    const double *weight = f->curve_weight + (f->stations - 1) * f->vertices;
+    const double *slopes = f->curve_slope + (f->stations - 1) * f->vertices;
     for (int v = 0; v < f->vertices; v++)
         for (int a = 0; a < 3; a++) {
             missing[a] -= weight[v] * points[3 * v + a];
-            slope[a] += s->curve_slope[v] * points[3 * v + a];
+            slope[a] += slopes[v] * points[3 * v + a];
         }
     double along = copysign(norm(slope, 3), dot(slope, axis, 3));
     for (int a = 0; a < 3; a++) missing[3 + a] = along * axis[a] - slope[a];
@@ -310,7 +308,7 @@ static int reverses(const StepData *s)
     if (!f->legs) return 0;
     double first = 0.0, last = 0.0;
     for (int a = 0; a < 3; a++) {
-        first += (v[3 + a] - v[a]) * s->normal[a];
+        first += (v[3 + a] - v[a]) * s->base_normal[a];
         last += (end[3 + a] - end[a]) * axis[a];
     }
     return first < 0.0 || (s->ends_along_tip && last < 0.0);
@@ -321,13 +319,13 @@ static double greatest_gap(const StepData *s)
 {
     const Fused *f = s->fused;
     double worst = 0.0;
-    for (int k = 0; k < s->stations; k++) {
+    for (int k = 0; k < f->stations; k++) {
         double square = 0.0;
         for (int a = 0; a < 3; a++) {
             double off = 0.0;
             for (int i = 0; i < 3; i++)
-                off += s->station_weight[3 * k + i] * s->next_nodes[3 * s->station_node[3 * k + i] + a];
-            for (int v = 0; v < f->vertices; v++) off -= s->curve_weight[k * f->vertices + v] * s->next_vertices[3 * v + a];
+                off += f->station_weight[3 * k + i] * s->next_nodes[3 * f->station_node[3 * k + i] + a];
+            for (int v = 0; v < f->vertices; v++) off -= f->curve_weight[k * f->vertices + v] * s->next_vertices[3 * v + a];
             square += off * off;
         }
         if (square > worst || square != square) worst = square;

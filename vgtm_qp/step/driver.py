@@ -88,15 +88,8 @@ class Driver:
         Seconds spent so far in the :data:`PHASES`; may be set to zero.
     """
 
-    def __init__(
-        self,
-        setup: Setup,
-        engine: FusedEngine,
-        accuracy: Accuracy,
-        separation: Separation,
-    ) -> None:
-        self._setup, self._engine, self._accuracy = setup, engine, accuracy
-        self._separation = separation
+    def __init__(self, setup: Setup, engine: FusedEngine, accuracy: Accuracy, separation: Separation) -> None:
+        self._setup, self._accuracy, self._separation = setup, accuracy, separation
         self._solver, self._layout = engine.solver, engine.layout
         self._work, self._known = self._solver.workspace, setup.arm.arithmetic()
         self._held: State | None = None
@@ -209,7 +202,8 @@ class Driver:
         began, watch, fcl = perf_counter(), self._watch, self._setup.monitor.scene.fcl
         assert watch is not None
         assert fcl is not None
-        for k in (self._asked == self._program.data.round).nonzero()[0].tolist():
+        asked = self._asked[: self._work.data.near] == self._program.data.round
+        for k in asked.nonzero()[0].tolist():
             group = watch.groups[self._group[k]].group
             piece = None if group.is_self else int(group.other[self._pair[k]])
             fcl.answer(self._questions[k], piece, self._answers[k])
@@ -312,8 +306,6 @@ class Driver:
             deviation=DEVIATION * arm.height,
             actuator=arm.actuators.astype(np.int32),
             home=arm.home_quantities,
-            tip_nodes=len(tip.nodes),
-            tip_node=tip.nodes.astype(np.int32),
             tip_weight=np.ascontiguousarray(tip.weights, dtype=float),
             influence=setup.influence,
             margin=setup.margin,
@@ -335,20 +327,13 @@ class Driver:
 
 
 def _of_curve(layout: Layout) -> dict[str, object]:
-    """Return by field what the C knows of stations and curve."""
-    stations, tracked = layout.arm.stations, layout.tracked
-    if not len(tracked):
-        return {"stations": 0}
-    nodes, weights = stations.nodes[tracked], stations.weights[tracked]
+    """Return by field what the C knows of the curve beside its rows."""
+    if not len(layout.tracked):
+        return {}
     return {
-        "stations": len(tracked),
         "ends_at_tip": int(layout.ends_at_tip),
         "ends_along_tip": int(layout.ends_along_tip),
         "must_track": int(layout.hard_tracking and not layout.hard_turns),
-        "station_node": np.ascontiguousarray(nodes, dtype=np.int32),
-        "station_weight": np.ascontiguousarray(weights),
-        "curve_weight": np.ascontiguousarray(layout.curve_weights),
-        "curve_slope": np.ascontiguousarray(layout.curve_slopes[-1]),
         "end_gain": np.ascontiguousarray(layout.end_gain),
-        "normal": np.ascontiguousarray(stations.frames[0][:, 2]),
+        "base_normal": np.ascontiguousarray(layout.arm.stations.frames[0][:, 2]),
     }
