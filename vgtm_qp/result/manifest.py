@@ -13,7 +13,8 @@ Its keys are:
 - `scenes`, where the scene changed while the arm ran: from each `row` on, to the next one's, the tables of `obstacle`,
   `safe` and `self_safe` of ``[clearance]``, `meshes` and `recovered` as above, and what is `carried` at the tip;
 - `certificate`, null before verification;
-- `clearance_rows`, numbers of rows by `fcl` and of `exact` ones in the QPs that moved the arm.
+- `clearance_rows`, numbers of rows by `fcl` and of `exact` ones in the QPs that moved the arm; where FCL is asked for
+  the rows that press alone, of these.
 """
 
 from __future__ import annotations
