@@ -540,15 +540,15 @@ static void advance(Fused *f, const double *x, int whole)
     for (int k = 0; k < f->torsion; k++) f->torsions[k] += free[1 + 3 * (f->vertices - 2) + k];
 }
 
-/* In place, the Cholesky factor of A (n, n) below its diagonal; 0 if A is not positive definite. */
+/* In place, the Cholesky factor of A (n, n) below its diagonal, whose inverse is on it; 0 if A is not positive definite. */
 static int factorise(double *A, int n)
 {
     for (int j = 0; j < n; j++) {
         double pivot = A[j * n + j] - dot(A + j * n, A + j * n, j);
         if (!(pivot > 0.0)) return 0;
-        pivot = sqrt(pivot);
+        pivot = 1.0 / sqrt(pivot);
         A[j * n + j] = pivot;
-        for (int i = j + 1; i < n; i++) A[i * n + j] = (A[i * n + j] - dot(A + i * n, A + j * n, j)) / pivot;
+        for (int i = j + 1; i < n; i++) A[i * n + j] = (A[i * n + j] - dot(A + i * n, A + j * n, j)) * pivot;
     }
     return 1;
 }
@@ -579,7 +579,7 @@ static int gain_of(Fused *f, Gain *g, double *work)
         double *half = g->half + k * free;
         for (int i = 0; i < free; i++)
             half[i] = (f->levers[k] * f->constraint[k * n + g->of[i]] - dot(g->factor + i * free, half, i))
-                / g->factor[i * free + i];
+                * g->factor[i * free + i];
     }
     for (int i = 0; i < m; i++)
         for (int j = 0; j <= i; j++) g->normal[i * m + j] = dot(g->half + i * free, g->half + j * free, free);
@@ -589,6 +589,7 @@ static int gain_of(Fused *f, Gain *g, double *work)
         least = fmin(least, g->normal[i * m + i]);
         greatest = fmax(greatest, g->normal[i * m + i]);
     }
+    /* Of the inverses of the pivots. */
     return greatest * greatest < f->worst_condition * least * least;
 }
 
@@ -598,16 +599,16 @@ static void change_by(const Fused *f, const Gain *g, const double *missing, doub
     int n = f->unknowns, m = f->tips + f->hard, free = g->free;
     double *shares = work, *part = work + m;
     for (int i = 0; i < m; i++)
-        shares[i] = (f->levers[i] * missing[i] - dot(g->normal + i * m, shares, i)) / g->normal[i * m + i];
+        shares[i] = (f->levers[i] * missing[i] - dot(g->normal + i * m, shares, i)) * g->normal[i * m + i];
     memset(part, 0, sizeof(double) * free);
     for (int i = m - 1; i >= 0; i--) {
-        shares[i] /= g->normal[i * m + i];
+        shares[i] *= g->normal[i * m + i];
         for (int j = 0; j < i; j++) shares[j] -= g->normal[i * m + j] * shares[i];
         for (int k = 0; k < free; k++) part[k] += shares[i] * g->half[i * free + k];
     }
     memset(change, 0, sizeof(double) * n);
     for (int i = free - 1; i >= 0; i--) {
-        part[i] /= g->factor[i * free + i];
+        part[i] *= g->factor[i * free + i];
         for (int j = 0; j < i; j++) part[j] -= g->factor[i * free + j] * part[i];
         change[g->of[i]] = part[i];
     }
