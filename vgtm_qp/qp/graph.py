@@ -170,21 +170,19 @@ class StationSymbols:
     gap, turn : (3,), (R,)
     face : (R, 9)
         Rows of the turns over the station's nodes.
-    weights : (3,)
-        Of the nodes in the station's position.
     """
 
     def __init__(self, layout: Layout) -> None:
-        nodes, self.weights = ca.SX.sym("nodes", 3, 3), ca.SX.sym("face", 3)
+        nodes, weights = ca.SX.sym("nodes", 3, 3), ca.SX.sym("face", 3)
         rotation, spin = ca.SX.sym("rotation", 3, 3), ca.SX.sym("spin", 3, 9)
-        self.inputs = [nodes, rotation, spin, self.weights]
+        self.inputs = [nodes, rotation, spin, weights]
         self._is_tabled = layout.general is None
         if self._is_tabled:
             vertices = ca.SX.sym("p", 3, layout.vertices)
-            self._at, self._slopes = ca.SX.sym("w", layout.vertices), ca.SX.sym("dw", layout.vertices)
-            self.inputs += [vertices, self._at, self._slopes]
-            point = vertices @ self._at
-            self.turn, c, self.slope = tracking.slope_rows(rotation, vertices @ self._slopes)
+            at, slopes = ca.SX.sym("w", layout.vertices), ca.SX.sym("dw", layout.vertices)
+            self.inputs += [vertices, at, slopes]
+            point = vertices @ at
+            self.turn, c, self.slope = tracking.slope_rows(rotation, vertices @ slopes)
         else:
             size = 3 * layout.vertices + layout.torsion
             point, position_rows = ca.SX.sym("position", 3), ca.SX.sym("position_rows", size, 3)
@@ -192,8 +190,8 @@ class StationSymbols:
             self.inputs += [point, position_rows, frame, spin_rows]
             # CasADi reads the frame's rows as columns.
             self.turn, c = tracking.turns(rotation, frame.T, layout.turns)
-            self._position, self._turned = position_rows.T, -c @ spin_rows.T
-        self.gap, self.face = tracking.gap(nodes @ self.weights, point), c @ spin
+            self._turned = -c @ spin_rows.T
+        self.gap, self.face = tracking.gap(nodes @ weights, point), c @ spin
         self._reaches = layout.reach, layout.reach / layout.arm.unit
 
     def drawn(self, hard_gap: Any, hard_turn: Any) -> tuple[Any, Any]:
@@ -209,23 +207,6 @@ class StationSymbols:
             for (error, mask), reach in zip(both, self._reaches, strict=True)
         )
         return gap, turn
-
-    def over_curve(self, offset: ca.SX, normal: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
-        """Return the rows (3, q) and (R, q) of gap and turn over the curve's free coordinates.
-
-        And their constants (3,) and (R,) for an `offset` of all coordinates: (3, V), or flat if the curve has
-        torsion.
-        """
-        if not self._is_tabled:
-            rows = -self._position, self._turned
-            free = [curve_rows.free_columns(row, normal) for row in rows]
-            return free[0], free[1], rows[0] @ offset, rows[1] @ offset
-        return (
-            -curve_rows.weighted_columns(self._at, normal, ca.SX.eye(3)),
-            curve_rows.weighted_columns(self._slopes, normal, self.slope),
-            -offset @ self._at,
-            self.slope @ (offset @ self._slopes),
-        )
 
     @property
     def curve(self) -> Any:

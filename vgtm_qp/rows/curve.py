@@ -81,14 +81,6 @@ def free_basis(normal: Array, size: int) -> Array:
     return basis
 
 
-def free_columns(rows: Any, normal: Any) -> Any:
-    """Return (R, q) rows over the coordinates that the base leaves free, from rows (R, 3 V + T) over all.
-
-    p_1 moves along the base normal (3,); all later control vertices and the torsion are free.
-    """
-    return ca.horzcat(rows[:, 3:6] @ normal, rows[:, 6:])
-
-
 def weighted_columns(weights: Any, normal: Any, factor: Any) -> Any:
     """Return (R, q) the derivative of factor (R, 3) @ sum_i w_i p_i by the free coordinates, eq. (35)."""
     return ca.horzcat(weights[1] * (factor @ normal), ca.kron(weights[2:].T, factor))
