@@ -12,10 +12,12 @@ from recorded_states import CASES
 from steps import drives_nothing
 
 import vgtm_qp as vq
-from vgtm_qp.compiled import compiler
+from vgtm_qp.compiled import Kernel, compiler, finish_compiling
 from vgtm_qp.native import building
+from vgtm_qp.problem.obstacle import Sphere
 from vgtm_qp.qp import fused
 from vgtm_qp.step.driver import Driver
+from vgtm_qp.step.path import Path
 from vgtm_qp.study.scenes import random_scene
 from vgtm_qp.study.serial_scenes import random_serial_scene
 
@@ -217,3 +219,98 @@ def test_an_arm_with_offset_joints_is_left_to_attempts(driven):
     assert resolver.setup.arm.arithmetic() is None
     assert resolver.step(position=resolver.tip()[0] + 0.01).moved
     assert not any(driven)
+
+
+@pytest.mark.parametrize(("start", "end"), [(0, 1), (1, 2), (2, 1), (1, 0), (0.5, 1.5), (2, 2.5), (1, 0.5)])
+def test_the_tip_is_on_its_path_whichever_way_it_goes(start, end, driven):
+    resolver = vq.Resolver(vq.load_problem("five_bay_free"))
+    for _ in range(4):
+        resolver.step(position=resolver.tip()[0])
+    tip, rotation = resolver.tip()
+    places = tip + np.array([[0.0, 0.0, 0.0], [0.02, 0.0, 0.0], [0.02, 0.02, -0.01]])
+    path = Path(np.array([0.0, 1.0, 2.0]), places, np.stack([rotation] * 3))
+    resolver.follow(Path.straight(tip, rotation, path.at(start).position, rotation, None), 0.0, 1.0)
+    driven.clear()
+    step = resolver.follow(path, start, end)
+    reached = path.at(start + step.progress * (end - start)).position
+    assert step.moved
+    np.testing.assert_allclose(resolver.tip()[0], reached, atol=1e-8)
+    assert driven == [(start, end) in ((0, 1), (1, 2), (2, 1))]
+
+
+def test_rows_of_another_scene_are_not_asked_about(rng):
+    resolver = vq.Resolver(vq.load_problem("five_bay_two_cubes"))
+    for k in range(60):
+        if k % 10 == 0:
+            for name in [one.name for one in resolver.obstacles if one.name.startswith("ball")]:
+                resolver.remove_obstacle(name)
+            way = rng.normal(size=3)
+        if k % 10 == 3:
+            for j in range(3):
+                aside = rng.normal(size=3)
+                center = resolver.state.nodes[rng.integers(3, 18)] + 0.35 * aside / np.linalg.norm(aside)
+                name = f"ball {k} {j}"
+                ball = Sphere(name=name, shape="sphere", center=center.tolist(), radius=0.15)
+                if resolver.add_obstacle(ball):
+                    resolver.remove_obstacle(name)
+        before = resolver.setup.monitor.scene.fcl.asked
+        step = resolver.step(position=resolver.tip()[0] + 0.04 * way / np.linalg.norm(way))
+        if step.qps == 1:
+            asked = resolver.setup.monitor.scene.fcl.asked - before
+            assert asked in (step.fcl_rows + step.exact_rows, asked if not step.moved else -1)
+
+
+def test_a_driver_serves_as_long_as_its_engine(monkeypatch, rng):
+    made, begin = [], Driver.__init__
+
+    def counted(self, *given):
+        made.append(self)
+        begin(self, *given)
+
+    monkeypatch.setattr(Driver, "__init__", counted)
+    resolver = vq.Resolver(vq.load_problem("snake_past_a_cube"))
+    home, vertex = resolver.tip()[0], resolver.state.control_vertices[2].copy()
+    for _ in range(6):
+        resolver.control_vertex_goals = {2: vertex + 0.01 * rng.normal(size=3)}
+        assert resolver.step(position=home + 0.01 * rng.normal(size=3)).moved
+    # For arms with and without such goals, each on the curve and off it.
+    assert len(made) <= 4
+
+
+def test_kernels_that_are_compiled_later_are_used(tmp_path, monkeypatch):
+    monkeypatch.setenv("VGTM_CACHE", str(tmp_path))
+    resolver = vq.Resolver(vq.load_problem("five_bay_free"))
+    home = resolver.tip()[0]
+
+    def tour(count):
+        for k in range(count):
+            assert resolver.step(position=home + 0.005 * np.array([k % 3, k % 2, 0.0])).moved
+
+    tour(20)
+    finish_compiling()
+    tour(2)
+    interpreted, call = list[str](), Kernel.__call__
+
+    def counted(self):
+        interpreted.append(self.name)
+        call(self)
+
+    monkeypatch.setattr(Kernel, "__call__", counted)
+    tour(2)
+    assert not {"rows", "close", "missing"} & {name.split("-")[0] for name in interpreted}
+
+
+def test_a_state_that_does_not_fit_leaves_nothing_behind():
+    problem = vq.load_problem("five_bay_free").replace({"clearance.self_collision": False})
+    resolver = vq.Resolver(problem)
+    for _ in range(5):
+        resolver.step(position=resolver.tip()[0] + [0.01, 0.0, 0.0])
+    good = resolver.state
+    q = good.q.copy()
+    q[3:] += [0.004, 0.0, 0.0]
+    resolver.state = replace(good, q=q, nodes=q, quantities=np.append(good.quantities, 0.0))
+    with pytest.raises(ValueError, match="could not broadcast"):
+        resolver.step(position=resolver.tip()[0] + [0.01, 0.0, 0.0])
+    resolver.state = good
+    step = resolver.step(position=resolver.tip()[0] + [0.01, 0.0, 0.0])
+    np.testing.assert_allclose(step.state.motion, step.state.q - good.q, atol=1e-15)

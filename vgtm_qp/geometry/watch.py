@@ -206,7 +206,8 @@ class Watch:
     def _is_at(self, X: Array) -> bool:
         """Return whether `X` (P, 3) are the positions of the present state."""
         way = self._way
-        return way is not None and way.data.reach > -np.inf and X.tobytes() == self._place.tobytes()
+        is_known = way is not None and not way.data.lost and way.data.reach > -np.inf
+        return is_known and X.tobytes() == self._place.tobytes()
 
     def _from_here(self, X: Array) -> Array:
         """Return (2, P, 3) the present place, `X` if there is none, and `X`."""

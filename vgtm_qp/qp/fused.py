@@ -275,9 +275,12 @@ class FusedWorkspace:
 
     @property
     def address(self) -> int:
-        """Of the structure; uses the kernels compiled meanwhile."""
-        self._program.refresh()
+        """Of the structure."""
         return self._program.address
+
+    def refresh(self) -> None:
+        """Use the kernels that were compiled meanwhile."""
+        self._program.refresh()
 
     def call(self, name: str, *arguments: float) -> Code:
         """Call a function of the C, and return its code."""

@@ -109,13 +109,13 @@ class Attempt:
             actuation.tolerance, tip=1e-8 * arm.unit, start=_SETTLING * arm.height, tracking=1e-7 * arm.unit
         )
         self.acceptance = Acceptance(setup, self.accuracy)
+        # Each curve has engines of its own, which are kept as well: see ``Shaping``.
+        self._drivers: dict[Engine, Driver] = {}
         self.use(setup)
 
     def use(self, setup: Setup) -> None:
         """Go on with the curve of another `setup` of the arm."""
-        self._setup = setup
-        self._can_drive = can_drive(setup)
-        self._drivers: dict[Engine, Driver] = {}
+        self._setup, self._can_drive = setup, can_drive(setup)
 
     @property
     def gives_way(self) -> bool:

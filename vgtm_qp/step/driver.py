@@ -118,6 +118,7 @@ class Driver:
             self._start()
         data = self._program.data
         self._program.refresh()
+        work.refresh()
         self._load(state, target, share)
         if watch is None:
             data.way = 0
@@ -157,6 +158,8 @@ class Driver:
         if self._setup.task.turns is not None:
             inputs[9].reshape(3, 3)[:], inputs[11][:] = goal.rotation.T, goal.spin
         if state is not self._held:
+            # What ends the writing half way must not leave a mixture that passes for a state.
+            self._held = None
             arrays = state.q, state.nodes, state.control_vertices, state.quantities, state.motion
             for part, values in zip(self._parts, arrays, strict=False):
                 self._before[part] = values.reshape(-1)
@@ -191,6 +194,7 @@ class Driver:
             late=late,
             tip=Pose(tip[:3], tip[3:].reshape(3, 3)),
         )
+        self._held = None
         self._before[:] = block[: len(self._before)]
         self._held = then
         return Passage(
@@ -245,18 +249,17 @@ class Driver:
         self._contacts, self._questions, self._answers = (np.zeros((rows, n)) for n in (CONTACT, 12, 7))
         self._group, self._pair, self._asked = (np.zeros(rows, dtype=np.int32) for _ in range(3))
         self._program.set(
-            room=rows,
             contacts=self._contacts,
             questions=self._questions,
             answers=self._answers,
             group=self._group,
             pair=self._pair,
             asked=self._asked,
+            room=rows,
         )
 
     def _start(self) -> None:
         """Allocate the arrays of the call, and set what stays the same."""
-        self._started = True
         setup, layout, arm, work = self._setup, self._layout, self._setup.arm, self._work
         self._program = program = Program("StepData")
         sizes = {
@@ -324,6 +327,7 @@ class Driver:
             **self._separation.pace,
             **_of_curve(layout),
         )
+        self._started = True
 
 
 def _of_curve(layout: Layout) -> dict[str, object]:

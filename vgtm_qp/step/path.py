@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from bisect import bisect_left, bisect_right
+from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -17,6 +17,9 @@ from vgtm_qp.rotation import rotation_from_vector, vector_from_rotation
 from vgtm_qp.rows.tip import TipGoal
 
 _NOT_FINITE = "a goal must be made of finite numbers; the state of the arm is unchanged"
+
+_ROUNDING = 1e-12
+"""Share of a piece by which a value beyond its end is still that of the end."""
 
 _UNIT, _AT_REST = np.array([0.0, 1.0]), np.zeros((1, 3))
 
@@ -115,9 +118,13 @@ class Path:
         return Pose(point.position, point.rotation)
 
     def is_straight(self, start: float, end: float) -> bool:
-        """Whether the rates are the same all the way between two values."""
-        low, high = (start, end) if start < end else (end, start)
-        return bisect_right(self._knots, low) >= bisect_left(self._knots, high)
+        """Whether the rates at `start`, see :meth:`at`, lead along the path all the way to `end`."""
+        knots = self._knots
+        k = min(max(bisect_right(knots, start) - 1, 0), len(knots) - 2)
+        low, high = knots[k], knots[k + 1]
+        spare = _ROUNDING * (high - low)
+        # A comparison with NaN fails.
+        return low - spare <= start <= high + spare and low - spare <= end <= high + spare
 
     def continued(self, pieces: float) -> Path:
         """Return the path extended by `pieces` times its last piece, but by less than half a turn."""
