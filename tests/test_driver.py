@@ -16,7 +16,8 @@ from vgtm_qp.compiled import Kernel, compiler, finish_compiling
 from vgtm_qp.native import building
 from vgtm_qp.problem.obstacle import Sphere
 from vgtm_qp.qp import fused
-from vgtm_qp.step.driver import Driver
+from vgtm_qp.rotation import rotation_from_vector, vector_from_rotation
+from vgtm_qp.step.driver import Driver, Passage
 from vgtm_qp.step.path import Path
 from vgtm_qp.study.scenes import random_scene
 from vgtm_qp.study.serial_scenes import random_serial_scene
@@ -37,7 +38,7 @@ def driven(monkeypatch) -> list[bool]:
 
     def counted(self, *asked):
         taken = take(self, *asked)
-        found.append(taken is not None)
+        found.append(isinstance(taken, Passage))
         return taken
 
     monkeypatch.setattr(Driver, "take", counted)
@@ -165,6 +166,34 @@ LIES = {
     "a node moved": ("closing_function", moved(9)),
     "at the goal": ("missing_function", lambda *all: (0.0 * all[3], *all[4:])),
 }
+
+
+@pytest.mark.parametrize("track", [["pointing"], ["orientation"]])
+def test_a_direction_that_is_not_the_goals_is_refused(track, driven, monkeypatch):
+    problem = vq.load_problem("hexapod_past_a_cube").to_dict()
+    problem["end_effector"]["track"] = track
+    problem["method"] = {"tracking": "none"}
+    del problem["curve"]
+    key = {"pointing": "pointing", "orientation": "rotation_vector"}[track[0]]
+    problem["maneuver"]["waypoint"] = [{"time": 1.0, key: [0.1, 0.0, 1.0]}]
+    problem["obstacle"] = []
+    rotation = vq.Resolver(vq.Problem.from_dict(problem)).tip()[1]
+    turned = rotation_from_vector([0.04, -0.03, 0.05]) @ rotation
+    goals = {
+        "pointing": {"pointing": turned[:, 2]},
+        "orientation": {"rotation_vector": vector_from_rotation(turned)},
+    }
+    goal = goals[track[0]]
+    honest = vq.Resolver(vq.Problem.from_dict(problem))
+    driven.clear()
+    assert honest.step(**goal, dt=1.0).status is vq.StepStatus.REACHED
+    assert all(driven)
+    monkeypatch.setattr(fused, "missing_function", lying(fused.missing_function, LIES["at the goal"][1]))
+    resolver = vq.Resolver(vq.Problem.from_dict(problem))
+    driven.clear()
+    assert resolver.step(**goal, dt=1.0).status is vq.StepStatus.BLOCKED
+    assert driven
+    assert not any(driven)
 
 
 @pytest.mark.parametrize("lie", LIES)
