@@ -126,14 +126,14 @@ def test_what_is_not_a_number_is_refused_and_forgotten(name, part, wrong):
 def test_named_solvers_have_the_engines_of_daqp(name):
     problem = vq.load_problem("five_bay_free").replace({"method.solver": name})
     assert isinstance(build_arm(problem).engine, FusedEngine)
-    long = problem.replace({"truss.bays": 16, "method.tracking_mode": "elastic"})
+    long = problem.replace({"truss.bays": 24, "method.tracking_mode": "elastic"})
     assert isinstance(build_arm(long).engine, ChainEngine)
 
 
 @pytest.mark.parametrize("mode", ["hard", "elastic"])
 def test_a_long_arm_goes_the_same_way_with_every_solver(mode):
     problem = vq.load_problem("ten_bay_round_a_cube").replace(
-        {"truss.bays": 20, "method.tracking_mode": mode, "maneuver.steps": 200, "method.retries": False}
+        {"truss.bays": 24, "method.tracking_mode": mode, "maneuver.steps": 200, "method.retries": False}
     )
     wanted: list[np.ndarray] = []
     for name in available_solvers():

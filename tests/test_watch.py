@@ -156,7 +156,8 @@ def test_scenes_that_are_watched():
     assert not watched(wedge)
     assert not watched(sphere("ball", [5.0, 0.0, 0.0], 0.2, [0.1, 0.0, 0.0]))
     assert not watched(self_collision=False)
-    assert not watched(members=[(k, k + 1) for k in range(200)])
+    assert watched(members=[(k, k + 1) for k in range(200)])
+    assert not watched(members=[(k, k + 1) for k in range(201)])
 
 
 def compare(first, second, X, **reach):
