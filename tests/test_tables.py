@@ -54,7 +54,11 @@ def test_a_table_outside_is_found():
 
 
 def test_the_list_is_complete():
-    assert tables.COMMANDS.keys() == STUDIES.keys() | {"serial", "changes", "bench"} == tables.SHORT.keys()
+    assert (
+        tables.COMMANDS.keys()
+        == STUDIES.keys() | {"serial", "changes", "bench", "peers"}
+        == tables.SHORT.keys()
+    )
     for name in tables.COMMANDS:
         assert tables.replaced(DOCUMENT, name, tables.block(DOCUMENT, name)).count(tables.marks(name)[0]) == 1
     marked = re.findall(r"^<!-- (\w+): ", DOCUMENT, flags=re.MULTILINE)

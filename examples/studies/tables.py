@@ -47,14 +47,16 @@ COMMANDS = {
     "--against ipopt",
     "changes": "vgtm study loops --scenes 100 --seed 20261203 --changes 0.4",
     "bench": "vgtm bench --seconds 0.7",
+    "peers": "vgtm bench --scene serial --scene snake --distance fcl --baselines mink --baselines pink --seconds 0.7",
 }
-LONG = {"tracking", "robustness", "serial", "loops"}
+LONG = {"tracking", "robustness", "serial", "loops", "peers"}
 """Made only where they are asked for by name, or with --short."""
 SHORT = {
     **{name: f"vgtm study {name} --short" for name in STUDIES},
     "serial": "vgtm study robustness --arms serial --short --against ipopt",
     "changes": "vgtm study loops --short --changes 0.4",
     "bench": "vgtm bench --scene cubes --bays 5 --tracking elastic --seconds 0.1 --steps 20 --baselines eq28",
+    "peers": "vgtm bench --scene serial --seconds 0.1 --steps 20 --baselines mink --baselines pink",
 }
 
 
