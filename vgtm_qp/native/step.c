@@ -35,10 +35,10 @@ typedef struct {
        rounding of a distance. */
     double safe, self_safe, margin, influence, share_of_way, least_way, rounding;
     double between, deviation;             /* violation that is allowed between states; greatest deviation from chords */
-    /* Whether another program supplies the contacts of rows that press: with multipliers above this. Its unit of length
-       per m; the greatest flaw of a proven answer, and the least distance of axes that have one, m. */
+    /* Whether another program supplies the contacts of rows that press. Its unit of length per m; the greatest flaw of a
+       proven answer, and the least distance of axes that have one, m. */
     int asks;
-    double pressing, scale, flaw, apart;
+    double scale, flaw, apart;
     /* Ratio of the displacement for which pairs are listed to the expected one; share of the last motion expected;
        and that of the limits of pairs that the next step may have. */
     double motion_margin, share, ahead;
@@ -158,15 +158,16 @@ static void look_ahead(StepData *s)
     s->self_limit = fmin(s->influence, s->self_safe + 2.0 * s->reach);
 }
 
-/* Ask for the contacts of the rows that press, but for those that were asked for before; return whether there are any. */
-static int who_presses(StepData *s)
+/* Ask for the contacts of all rows, or of those that press: whose multipliers are not zero. Those that were asked for
+   before are left out; return whether there are others. */
+static int ask_for(StepData *s, int all)
 {
     Fused *f = s->fused;
     const double *multiplier = f->multipliers + f->unknowns + f->tips + f->hard + f->legs;
     int before = s->asked_for;
     s->round++;
     for (int k = 0; k < f->near; k++) {
-        if (s->asked[k] || !(fabs(multiplier[k]) > s->pressing)) continue;
+        if (s->asked[k] || !(all || fabs(multiplier[k]) > 0.0)) continue;
         const Pairs *p = s->way->group[s->group[k]];
         double ends[6];
         ends_for(p, s->pair[k], s->nodes, s->contacts + CONTACT * k, ends);
@@ -427,7 +428,7 @@ static int arrive(StepData *s)
 static int proceed(StepData *s, double *mark)
 {
     int code = answer(s->fused);
-    if (!code && s->asks && who_presses(s)) code = ASKS;
+    if (!code && s->asks && !s->fused->other && ask_for(s, 0)) code = ASKS;
     else if (!code) code = depart(s->fused, s->tolerance);
     spend(&s->spent[QP], mark);
     if (code) return code;
@@ -450,6 +451,8 @@ EXPORT int take(StepData *s)
     }
     load(s);
     code = assemble(s->fused);
+    /* A solver that only comes near zero does not say which rows press, and is too slow to be asked twice. */
+    if (!code && s->asks && s->fused->other && ask_for(s, 1)) code = ASKS;
     spend(&s->spent[QP], &mark);
     return code ? code : proceed(s, &mark);
 }

@@ -19,7 +19,6 @@ from vgtm_qp.geometry.pairs import Pair
 from vgtm_qp.geometry.watch import AHEAD, Watch
 from vgtm_qp.native import Code, Program
 from vgtm_qp.qp.answer import Accuracy, Move, StepSolution
-from vgtm_qp.qp.daqp import DAQP
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.qp.residual import TOLERANCE
@@ -48,9 +47,6 @@ PHASES = "distance", "qp", "acceptance"
 
 _ROOM = 64
 """Capacity at first: rows of clearance."""
-
-_PRESSING = 1e-9
-"""Multiplier above which a row presses, by a solver that only comes near zero."""
 
 
 class Passage(NamedTuple):
@@ -237,7 +233,6 @@ class Driver:
             return {"asks": 0}
         return {
             "asks": 1,
-            "pressing": 0.0 if self._solver.solver is DAQP else _PRESSING,
             "scale": scene.fcl.scale,
             "flaw": PROOF * scene.unit,
             "apart": NORMAL_FROM * scene.unit,
