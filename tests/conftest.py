@@ -4,6 +4,7 @@ import os
 import secrets
 import signal
 import zlib
+from typing import Any
 
 # Each process of the tests has a core of its own. NumPy reads this when it is first imported.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -32,9 +33,15 @@ def pytest_configure(config: pytest.Config) -> None:
     """Choose the seed of the run, unless it is given, before hypothesis asks for it; workers are given the run's."""
     option = config.option
     if option.seed is None:
-        option.seed = secrets.randbits(32)
+        option.seed = getattr(config, "workerinput", {}).get("seed", secrets.randbits(32))
     if option.hypothesis_seed is None:
         option.hypothesis_seed = str(option.seed)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_configure_node(node: Any) -> None:
+    """Give a worker the seed of the run."""
+    node.workerinput["seed"] = node.config.option.seed
 
 
 def pytest_report_header(config: pytest.Config) -> str:

@@ -138,6 +138,16 @@ def test_cut_file_is_refused(saved: Path, kept: float) -> None:
         load_result(saved)
 
 
+def test_a_header_whose_brackets_never_close_is_refused(saved: Path) -> None:
+    with zipfile.ZipFile(saved) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(saved, "w") as archive:
+        for name, content in members.items():
+            archive.writestr(name, content.replace(b"'shape': (", b"'shap: (((", 1))
+    with pytest.raises(ResultError, match="cannot be read"):
+        load_result(saved)
+
+
 @settings(max_examples=60, deadline=None)
 @given(st.data())
 def test_a_flipped_byte_is_refused_or_changes_nothing(data: st.DataObject) -> None:

@@ -13,6 +13,7 @@ import zlib
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from tokenize import TokenError
 from typing import IO, Any, NamedTuple
 
 import numpy as np
@@ -253,7 +254,7 @@ def _header(about: str, stream: IO[bytes], size: int) -> _Header:
         )
         shape, _, dtype = read(stream)
         begin = stream.tell()
-    except (ValueError, TypeError, SyntaxError, RecursionError, MemoryError) as error:
+    except (ValueError, TypeError, SyntaxError, TokenError, RecursionError, MemoryError) as error:
         raise ResultError(f"{about} cannot be read: {str(error)[:200]}") from None
     bytes_claimed = math.prod(shape) * dtype.itemsize
     # Items without bytes could be any number.
