@@ -326,7 +326,8 @@ def test_step_certificate_and_summary_say_who_supplied_the_rows(maneuvers):
         assert counts == maneuver.summary()["clearance_rows"]
         assert (certificate.fcl_rows.value, certificate.exact_rows.value) == (counts["fcl"], counts["exact"])
         assert certificate.ok
-        assert counts[name] >= 10
+        # FCL is asked for the rows that press alone.
+        assert counts[name] > (10 if name == "fcl" else 50)
         assert sum(counts.values()) == counts[name]
         old = {key: value for key, value in certificate.to_dict().items() if not key.endswith("_rows")}
         assert Certificate.from_dict(old).fcl_rows.value is None
@@ -345,7 +346,7 @@ def test_between_cylinders_the_states_are_those_of_closed_forms_to_what_fcl_leav
         data["clearance"]["distance"] = name
         maneuver = vq.solve(vq.Problem.from_dict(data))
         assert maneuver.certificate.ok
-        assert maneuver.manifest["clearance_rows"][name] >= 5
+        assert maneuver.manifest["clearance_rows"][name] > (5 if name == "fcl" else 20)
         found.append(maneuver)
     assert found[0].manifest["clearance_rows"]["exact"] == 0
     np.testing.assert_allclose(found[0].nodes, found[1].nodes, atol=1e-4)

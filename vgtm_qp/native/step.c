@@ -84,7 +84,7 @@ static void spend(double *phase, double *mark)
     *mark = time;
 }
 
-/* The row of contact k: eq. of rows/clearance.py, limited so that a zero step is allowed and pairs slow down. */
+/* The row of contact k, see rows/clearance.py, limited so that a zero step is allowed and pairs slow down. */
 static void clearance_row(StepData *s, int k)
 {
     Fused *f = s->fused;

@@ -6,6 +6,7 @@ It answers the same QP as :mod:`vgtm_qp.qp.condensed`, in a tenth of the time fo
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.arm.joint_space import JointSpaceArm
-from vgtm_qp.arm.symbols import Constants
+from vgtm_qp.arm.symbols import Constants, EliminationStage
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.errors import EvaluationError
@@ -241,9 +242,10 @@ class FusedWorkspace:
         self.actuators, self.equal = len(arm.actuators), equal
         self.size, self.first_near = self.actuators + layout.free_curve + 1, equal + len(layout.legs)
         self.torsion, self.shape = self.size - 1 - layout.torsion, arm.home_configuration.shape
-        self._by_twists = (
-            arm.symbols(Constants()).twists(ca.MX.sym("q", arm.home_configuration.size)) is not None
-        )
+        symbols = arm.symbols(Constants())
+        self._stages = symbols.elimination()
+        moves_by_twists = symbols.twists(ca.MX.sym("q", *symbols.shape)) is not None
+        self._movers = _movers(layout) if moves_by_twists else None
         self._is_ready: bool | None = None
         self._accuracy: Accuracy | None = None
         self._goals: object = None
@@ -339,13 +341,13 @@ class FusedWorkspace:
     def displacement(self, x: Array, constant: float) -> Array:
         """Return (N - N_c, 3) displacements of the free nodes by `x`, and `constant` times the known ones, m."""
         count = self.actuators
-        if not self._by_twists:
+        if self._movers is None:
             moved = self._response[:, 1:] @ x[:count] + constant * self._response[:, 0]
             return np.asarray(moved.reshape(-1, 3))
         twists, places = self._moving[0].reshape(-1, 6), self._moving[1].reshape(-1, 3)
         known = self._moved.reshape(-1, 3)[self._layout.arm.free]
         summed = np.concatenate([np.zeros((1, 6)), np.cumsum(x[:count, None] * twists, axis=0)])
-        summed = summed[_movers(self._layout)]
+        summed = summed[self._movers]
         return np.asarray(np.cross(summed[:, :3], places) + summed[:, 3:] + constant * known)
 
     def take(self, clearance: ClearanceRows) -> int:
@@ -394,7 +396,7 @@ class FusedWorkspace:
         self.q, self.points, self.gone = missing.inputs[0], missing.inputs[3], missing.inputs[common]
         self.started, self.started_points = self.q.copy(), self.points.copy()
         size, equal, nodes = self.size, self.equal, layout.node_columns
-        rows = layout.least_squares - (nodes if self._by_twists else 0)
+        rows = layout.least_squares - (0 if self._movers is None else nodes)
         self.hessian, self.gradient, self.x = np.zeros((size, size)), np.zeros(size), np.zeros(size)
         found = dict(zip(RESULTS, condense.outputs, strict=False))
         self._moving, self._moved = condense.outputs[len(RESULTS) :], found["moved"]
@@ -408,16 +410,17 @@ class FusedWorkspace:
         # The bounds are written where the QP has them.
         self._program.set(**{name: array for name, array in found.items() if name not in ("lower", "upper")})
         self._program.set(**_composition(layout, condense))
-        if self._by_twists:
+        if self._movers is not None:
             twists, places = self._moving
             free = layout.arm.free.astype(np.int32)
-            self._program.set(twists=twists, free=places, free_node=free, movers=_movers(layout))
+            self._program.set(twists=twists, free=places, free_node=free, movers=self._movers)
         else:
             gradients, rhs = self._moving
-            self._program.set(gradients=gradients, rhs=rhs, response=self._response, **_elimination(layout))
+            self._program.set(gradients=gradients, rhs=rhs, response=self._response)
+            self._program.set(**_elimination(layout, self._stages))
         self._program.set(
             stack=self.stack,
-            first_row=_first_rows(layout, size),
+            first_row=_first_rows(layout, self._stages, size),
             squares=rows,
             hard_at=(rows - (layout.least_squares - nodes) + layout.hard).astype(np.int32),
             hessian=self.hessian,
@@ -535,9 +538,9 @@ def _composition(layout: Layout, condense: Kernel) -> dict[str, Any]:
     }
 
 
-def _elimination(layout: Layout) -> dict[str, Any]:
-    """Return by field the elimination of an arm; see ``arm.symbols.EliminationStage``."""
-    arm, stages = layout.arm, layout.arm.symbols(Constants()).elimination()
+def _elimination(layout: Layout, stages: Sequence[EliminationStage]) -> dict[str, Any]:
+    """Return by field what the C knows of the stages of an elimination."""
+    arm = layout.arm
     if not stages:
         return {"stages": 0}
     entries, columns = np.cumsum([0, *(len(stage.row) for stage in stages)]), []
@@ -567,10 +570,9 @@ def _elimination(layout: Layout) -> dict[str, Any]:
     }
 
 
-def _first_rows(layout: Layout, size: int) -> NDArray[np.int32]:
+def _first_rows(layout: Layout, stages: Sequence[EliminationStage], size: int) -> NDArray[np.int32]:
     """Return (n,) the first least-squares row that each unknown can change; actuators move what is placed with them."""
     arm, first = layout.arm, np.zeros(size, dtype=np.int32)
-    stages = arm.symbols(Constants()).elimination()
     if not stages:
         return first
     count = len(arm.actuators)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import casadi as ca
 
 from vgtm_qp.arm.symbols import Bound, Constants
-from vgtm_qp.qp.graph import StationSymbols, StepGraph
+from vgtm_qp.qp.graph import StepGraph, station_rows
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.numbers import UNBOUNDED
 from vgtm_qp.rows.tip import progress_gradient
@@ -69,35 +69,12 @@ def row_function(layout: Layout) -> Bound:
             graph.normal,
             _leg_rows(graph),
             graph.leg_lower,
-            *_stations(graph),
+            *station_rows(graph),
             motion * graph.given[4] if layout.spacings else ca.MX(0, 1),
             graph.moved,
             *moving,
         ],
     )
-
-
-def _stations(graph: StepGraph) -> list[ca.MX]:
-    """Return gaps, turns, and rows of the turns over nodes and curve of all tracked stations."""
-    layout = graph.layout
-    if not layout.vertices:
-        return [ca.MX(0, 0)] * 4
-    station = StationSymbols(layout)
-    masks = ca.SX.sym("hard_gap", 3), ca.SX.sym("hard_turn", layout.turns)
-    motion = ca.SX.sym("motion")
-    # Corrections close hard rows as well.
-    errors = [
-        (mask + (1.0 - mask) * motion) * error
-        for mask, error in zip(masks, station.drawn(*masks), strict=True)
-    ]
-    results = [ca.densify(result) for result in (*errors, station.face, station.curve)]
-    function = ca.Function("station", [*station.inputs, *masks, motion], results)
-    hard = [ca.DM(mask.astype(float)) for mask in (layout.hard_gaps, layout.hard_tilts)]
-    found = [
-        function(*graph.station(k), *(mask[k, :].T for mask in hard), graph.motion)
-        for k in range(len(layout.tracked))
-    ]
-    return [ca.horzcat(*column) for column in zip(*found, strict=True)]
 
 
 def _leg_rows(graph: StepGraph) -> ca.MX:

@@ -214,6 +214,31 @@ class StationSymbols:
         return self.slope if self._is_tabled else self._turned
 
 
+def station_rows(graph: StepGraph) -> list[ca.MX]:
+    """Return gaps (3, K), turns (R, K), rows of the turns over the stations' nodes (R, 9 K), and over the curve.
+
+    One block a tracked station; see :class:`StationSymbols`. In a correction only the equalities are closed.
+    """
+    layout = graph.layout
+    if not layout.vertices:
+        return [ca.MX(0, 0)] * 4
+    station = StationSymbols(layout)
+    masks = ca.SX.sym("hard_gap", 3), ca.SX.sym("hard_turn", layout.turns)
+    motion = ca.SX.sym("motion")
+    errors = [
+        (mask + (1.0 - mask) * motion) * error
+        for mask, error in zip(masks, station.drawn(*masks), strict=True)
+    ]
+    results = [ca.densify(result) for result in (*errors, station.face, station.curve)]
+    function = ca.Function("station", [*station.inputs, *masks, motion], results)
+    hard = [ca.DM(mask.astype(float)) for mask in (layout.hard_gaps, layout.hard_tilts)]
+    found = [
+        function(*graph.station(k), *(mask[k, :].T for mask in hard), graph.motion)
+        for k in range(len(layout.tracked))
+    ]
+    return [ca.horzcat(*column) for column in zip(*found, strict=True)]
+
+
 def tip_frames(layout: Layout, constants: Constants) -> Frames:
     """Return the end effector's frame."""
     arm, tip = layout.arm, layout.arm.end_effector

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import casadi as ca
 import numpy as np
 
 from vgtm_qp.arm.symbols import Bound, Constants
 from vgtm_qp.arrays import Array
 from vgtm_qp.compiled import Kernel
-from vgtm_qp.qp.graph import StationSymbols, StepGraph
+from vgtm_qp.qp.graph import StepGraph, station_rows
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.numbers import ClearanceRows, Legs, StepNumbers
 from vgtm_qp.qp.shape import CurveRows
@@ -120,8 +119,6 @@ class Linearisation:
             base_rhs = -base_axes @ (vertices[1] - vertices[0])
         if moves:
             pull = layout.vertex_gradient(vertices, asked.vertex_goals)
-        if not moves:
-            gap, turn = gap * layout.hard_gaps, turn * layout.hard_tilts
         face = face.reshape(count, 9, turns).transpose(0, 2, 1)
         curve = curve.reshape(count, curve.size // max(count * turns, 1), turns).transpose(0, 2, 1)
         spacing = np.zeros(0) if asked.curve is None else asked.curve.spacing
@@ -168,21 +165,7 @@ def linear_function(layout: Layout) -> Bound:
     """
     constants = Constants()
     graph = StepGraph(layout, layout.arm.symbols(constants), constants)
-    symbols, none = graph.symbols, ca.MX(0, 0)
-    blocks: list[list[ca.MX]] = [[none], [none], [none], [none]]
-    if layout.vertices:
-        station = StationSymbols(layout)
-        hard = [ca.SX.sym("hard_gap", 3), ca.SX.sym("hard_turn", layout.turns)]
-        results = [*station.drawn(*hard), station.face, station.curve]
-        function = ca.Function(
-            "station", [*station.inputs, *hard], [ca.densify(result) for result in results]
-        )
-        masks = layout.hard_gaps.astype(float), layout.hard_tilts.astype(float)
-        found = [
-            function(*graph.station(k), *(ca.DM(mask[k]) for mask in masks))
-            for k in range(len(layout.tracked))
-        ]
-        blocks = [list(column) for column in zip(*found, strict=True)]
+    symbols = graph.symbols
     outputs = [
         symbols.quantities(graph.q),
         graph.strokes,
@@ -194,7 +177,7 @@ def linear_function(layout: Layout) -> Bound:
         graph.base_axes,
         graph.leg_axes,
         graph.leg_lower,
-        *(ca.horzcat(*block) for block in blocks),
+        *station_rows(graph),
         *symbols.motion(graph.q, graph.at, graph.moved),
     ]
     return graph.bound("linear", outputs)

@@ -24,7 +24,7 @@ from vgtm_qp.step.driver import (
     LEAP,
     MOTION_MARGIN,
     PHASES,
-    TOO_FAR,
+    SINGULAR,
     Begun,
     Driver,
     Passage,
@@ -320,7 +320,7 @@ class Attempt:
         """Return why the QP's answer leads too far from `state` for its rows; empty if it does not."""
         height = self._arm.height
         is_finite = move.closed is not None or np.isfinite(move.q).all()
-        if not move.furthest < TOO_FAR * height or not is_finite:
+        if not move.furthest < SINGULAR * height or not is_finite:
             return "singular pose"
         leap = np.abs(move.vertices - state.control_vertices).max(initial=0.0)
         return "" if leap < LEAP * height else "the curve moves too far in one step"

@@ -33,7 +33,7 @@ from vgtm_qp.step.target import Target
 MOTION_MARGIN = 2.5
 """Ratio of the displacement for which pairs are listed to the expected displacement of a node."""
 
-TOO_FAR = 1e3
+SINGULAR = 1e3
 """Displacement of a node, over the arm's length, above which a QP's answer shows a singular pose."""
 
 LEAP = 1.0
@@ -310,7 +310,7 @@ class Driver:
             **self._of_fcl(),
             motion_margin=MOTION_MARGIN,
             ahead=AHEAD,
-            furthest=TOO_FAR * arm.height,
+            furthest=SINGULAR * arm.height,
             leap=LEAP * arm.height,
             member=LOOSER * self._accuracy.member,
             tip=LOOSER * self._accuracy.tip,
