@@ -44,6 +44,27 @@ def test_without_the_named_obstacles_or_limits_a_blocked_arm_gets_further(rng):
     assert further.count(False) <= 1
 
 
+@pytest.mark.parametrize("_", range(10))
+def test_where_it_stops_an_arm_goes_on_at_once_without_the_named_obstacles(_, rng):
+    problem = three_bays(obstacle=boxes(rng))
+    resolver, goal = vq.Resolver(problem), np.array(problem.maneuver.waypoint[-1].position)
+    for _ in range(80):
+        step = resolver.step(position=goal)
+        if step.status is vq.StepStatus.REACHED or not step.moved or step.progress < 1e-4:
+            break
+    left = np.linalg.norm(goal - resolver.tip()[0])
+    if step.status is vq.StepStatus.REACHED:
+        return
+    path = resolver.setup.task.path_to(resolver.tip(), goal, None, None)
+    stop = resolver.explain(path, 0.0, 1.0, last=step)
+    assert stop.obstacles
+    for name in stop.obstacles:
+        resolver.remove_obstacle(name)
+    for _ in range(3):
+        resolver.step(position=goal)
+    assert np.linalg.norm(goal - resolver.tip()[0]) < left - 1e-3
+
+
 def test_some_of_the_random_scenes_are_blocked_by_obstacles():
     kinds = [
         vq.solve(three_bays(obstacle=boxes(np.random.default_rng(seed))), verify=False).manifest["stop"]
