@@ -80,11 +80,10 @@ def mjcf(maneuver: Result) -> str:
     drawing = drawing_of_maneuver(maneuver)
     asset, world = _add_view(root, maneuver, drawing), _add(root, "worldbody")
     _add(world, "light", pos=(0.0, 0.0, 0.0), dir=(-0.3, 0.5, -0.8), directional="true", diffuse=_LIGHT)
-    names = [str(node) for node in maneuver.manifest["arm"].get("node_names") or ()]
     if isinstance(arm, RecordedChain):
         _add_joints(asset, world, arm, maneuver.manifest["problem"]["arm"]["joint"])
     else:
-        _add_nodes(world, arm, names)
+        _add_nodes(world, arm)
     obstacles = drawing.obstacles
     tables = {entry["name"]: entry for entry in maneuver.manifest["problem"].get("obstacle") or ()}
     for mesh in obstacles:
@@ -92,7 +91,7 @@ def mjcf(maneuver: Result) -> str:
     if isinstance(arm, RecordedChain):
         _add_drives(root, arm)
     else:
-        _add_members(root, arm, names)
+        _add_members(root, arm)
     _add_keyframes(root, maneuver, arm, [mesh for mesh in obstacles if mesh.velocity.any()])
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode") + "\n"
@@ -139,9 +138,9 @@ def node_masses(arm: RecordedArm) -> Array:
     return np.bincount(arm.members.reshape(-1), np.repeat(half, 2), minlength=len(arm.home)).astype(float)
 
 
-def _add_nodes(world: Element, arm: RecordedArm, names: list[str]) -> None:
+def _add_nodes(world: Element, arm: RecordedArm) -> None:
     masses, radius = node_masses(arm), max(float(np.median(arm.radius)), _THINNEST)
-    for k, name in enumerate(names):
+    for k, name in enumerate(arm.node_names):
         body = _add(world, "body", name=name, pos=arm.home[k])
         if k in arm.base:
             body.set("mocap", "true")
@@ -256,7 +255,7 @@ def _add_obstacle(
         geom.set("axisangle", _text((*(turn / angle), angle)))
 
 
-def _add_members(root: Element, arm: RecordedArm, names: list[str]) -> None:
+def _add_members(root: Element, arm: RecordedArm) -> None:
     tendons, equalities, actuators = (_add(root, kind) for kind in ("tendon", "equality", "actuator"))
     for k, member in enumerate(arm.member_names):
         colour = stroke_colours(np.array(0.5)) if arm.actuated[k] else np.array(FIXED_COLOUR)
@@ -264,7 +263,7 @@ def _add_members(root: Element, arm: RecordedArm, names: list[str]) -> None:
             tendons, "spatial", name=member, width=max(arm.radius[k], _THINNEST), rgba=(*colour, 1.0)
         )
         for node in arm.members[k]:
-            _add(tendon, "site", site=names[node])
+            _add(tendon, "site", site=arm.node_names[node])
         active = "false" if arm.actuated[k] else "true"
         _add(equalities, "tendon", name=member, tendon1=member, active=active, **_STIFF)
         if arm.actuated[k]:

@@ -31,6 +31,8 @@ class RecordedArm:
         The two nodes of each member.
     home : (N, 3)
         Home positions of the nodes, m.
+    node_names : tuple of str
+        Name of each node.
     base, free : (N_c,) int, (N - N_c,) int
         Given nodes, and all others.
     actuated, stretches : (M,) bool
@@ -56,7 +58,7 @@ class RecordedArm:
         table = Record(record, "manifest.arm")
         self.home = table.numbers("home", (None, 3))
         nodes = len(self.home)
-        self.base = table.integers("base", (None,), nodes)
+        self.base, self.node_names = table.integers("base", (None,), nodes), table.names("node_names", nodes)
         self.member_names = table.names("member_names", count)
         self.actuated = self.stretches = table.flags("actuated", (count,))
         self.length = table.numbers("length", (count,))
