@@ -84,6 +84,37 @@ def test_the_folder_of_the_compiler_may_have_a_space(tmp_path, monkeypatch, as_g
     assert (tmp_path / "ran").exists()
 
 
+@needs_compiler
+def test_code_that_has_not_the_values_of_its_function_is_not_used(tmp_path, monkeypatch, caplog):
+    """The compiler of this test reads another number than was written, as one was seen to copy constants wrongly."""
+    monkeypatch.setenv("VGTM_CACHE", str(tmp_path / "cache"))
+    wrapper = tmp_path / "cc"
+    wrapper.write_text(f'#!/bin/sh\nexec sed "s/3.75/3.76/" | {compiler()} "$@"\n')
+    wrapper.chmod(0o755)
+    monkeypatch.setenv("VGTM_CC", str(wrapper))
+    right = Kernel(_long("right", 3.5))
+    assert right.compile()
+    assert not caplog.text
+    wrong = Kernel(_long("wrong", 3.75))
+    assert not wrong.compile()
+    assert f"{wrapper} made code that has wrong values" in caplog.text
+    wrong.inputs[0][:] = right.inputs[0][:] = 0.7
+    wrong()
+    right()
+    assert np.allclose(wrong.outputs[0] / 3.75, right.outputs[0] / 3.5, rtol=1e-12)
+
+
+@needs_compiler
+def test_rounding_that_grows_to_as_much_as_the_values_is_no_fault(tmp_path, monkeypatch, caplog):
+    monkeypatch.setenv("VGTM_CACHE", str(tmp_path / "cache"))
+    x = ca.SX.sym("x", 3)
+    y = x
+    for _ in range(48):
+        y = ca.vertcat(y[1], y[2], ca.sin(20.0 * y[0] + 0.1 * y[1]))
+    assert Kernel(ca.Function("steep", [x], [y])).compile()
+    assert not caplog.text
+
+
 @pytest.mark.parametrize("as_given", ["", "none", "  ", "no-such-compiler -m64", "'cc"])
 def test_without_a_compiler_by_that_name_the_virtual_machine_serves(monkeypatch, as_given):
     monkeypatch.setenv("VGTM_CC", as_given)

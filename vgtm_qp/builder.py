@@ -27,8 +27,10 @@ from pathlib import Path
 from typing import Any
 
 import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
 
-from vgtm_qp.compiled import FLAGS, HUNG, QUICK, digest_file, is_sound
+from vgtm_qp.compiled import FLAGS, HUNG, QUICK, WRONG, digest_file, is_sound
 
 _LONG = 100_000
 """Length of a source text, in characters, above which compiling takes seconds."""
@@ -44,6 +46,10 @@ _TICK = 0.05
 
 _ABANDONED = 3.0
 """Age at which a folder counts as abandoned, over the time after which a compiler counts as hung."""
+
+_TRIALS, _ERROR, _LAST_DIGITS = 3, 1e-6, 1e-12
+"""Arguments at which code is compared with its function; difference, over the greatest value, that is no rounding; and
+relative differences of arguments that may do as much as rounding does on the way."""
 
 _WORTH_IT = 100
 """Number of lines below which functions are not compiled separately."""
@@ -106,6 +112,37 @@ def _with_fast_helpers(source: str) -> str:
     )
 
 
+def is_true_to(function: ca.Function, library: Path) -> bool:
+    """Whether a library has the values of the function that it was made of; compilers make mistakes.
+
+    It has not if a result is another one at all of some random arguments, by more than rounding can do: arguments that
+    differ in their last digits show how much that is. What has no values there is not compared.
+    """
+    rng = np.random.default_rng(0)
+    differs = np.ones(function.n_out(), dtype=bool)
+    for _ in range(_TRIALS):
+        given = [rng.uniform(0.5, 1.5, function.nnz_in(k)) for k in range(function.n_in())]
+        nearly = [values * (1.0 + _LAST_DIGITS * rng.uniform(-1.0, 1.0, values.shape)) for values in given]
+        try:
+            compiled = ca.external(function.name(), str(library))
+            pairs = (function, given), (function, nearly), (compiled, given)
+            every = list(zip(*(_values(*pair) for pair in pairs), strict=True))
+        except RuntimeError:
+            return True
+        for k, (wanted, close, found) in enumerate(every):
+            error = _ERROR * np.abs(wanted).max(initial=1.0) + np.abs(close - wanted).max(initial=0.0)
+            # Infinities are equal; NaN differs from everything, and proves nothing.
+            off = (wanted != found) & ~(np.abs(wanted - found) <= error)
+            differs[k] &= bool(off.any()) and not np.isnan(wanted).any()
+    return not differs.any()
+
+
+def _values(function: ca.Function, given: list[NDArray[np.float64]]) -> list[NDArray[np.float64]]:
+    """Return the nonzeros of the results of a function at those of its arguments."""
+    arguments = [ca.DM(function.sparsity_in(k), values) for k, values in enumerate(given)]
+    return [np.array(result.nonzeros()) for result in function.call(arguments)]
+
+
 class Builder:
     """The compilers at work and the objects they make.
 
@@ -113,13 +150,13 @@ class Builder:
     ----------
     patience : float
         Seconds after which a compiler counts as hung.
-    hung : bool
-        Whether one hung.
+    hung, erred : bool
+        Whether one hung, or made code of other values than its function's.
     """
 
     def __init__(self) -> None:
         self.patience = 60.0
-        self.hung = self._stopped = False
+        self.hung = self.erred = self._stopped = False
         self._lock = threading.Lock()
         self._compilers = ThreadPoolExecutor(min(_MOST_COMPILERS, os.cpu_count() or 1))
         self._linkers = ThreadPoolExecutor(_MOST_LINKERS)
@@ -134,11 +171,12 @@ class Builder:
         library, cc = Path(job["library"]), job["cc"]
         if is_sound(library):
             return
-        main, texts = library.with_suffix(".o"), {}
+        main, texts, function = library.with_suffix(".o"), {}, None
         if "text" in job:
             rest, flags = job["text"], job["flags"]
         else:
-            rest, units = split(source_of(ca.Function.deserialize(job["function"])))
+            function = ca.Function.deserialize(job["function"])
+            rest, units = split(source_of(function))
             texts = {library.with_name(f"{name}-{job['key']}.o"): text for name, text in units.items()}
             flags = QUICK if len(rest) > _LONG else ()
             rest = _with_fast_helpers(rest) if flags else rest
@@ -150,7 +188,7 @@ class Builder:
             )
             for path in sorted(texts, key=lambda path: -len(texts[path]))
         }
-        self._linkers.submit(self._link, cc, objects, library)
+        self._linkers.submit(self._link, cc, objects, library, function)
 
     def finish(self) -> None:
         """Wait for all libraries."""
@@ -178,11 +216,13 @@ class Builder:
             self._objects[target] = self._compilers.submit(self._make, target, command, text, library=library)
         return self._objects[target]
 
-    def _link(self, cc: str, objects: dict[Path, Future[bool]], library: Path) -> None:
-        """Make the shared library of `objects`."""
+    def _link(
+        self, cc: str, objects: dict[Path, Future[bool]], library: Path, function: ca.Function | None
+    ) -> None:
+        """Make the shared library of `objects`, which must have the values of the `function`."""
         if all(begun.result() for begun in objects.values()):
             command = [*shlex.split(cc), "-shared", *map(str, objects), "-lm"]
-            self._make(library, command, spent=library.with_suffix(".o"))
+            self._make(library, command, spent=library.with_suffix(".o"), function=function)
 
     def _make(
         self,
@@ -192,8 +232,11 @@ class Builder:
         *,
         spent: Path | None = None,
         library: Path | None = None,
+        function: ca.Function | None = None,
     ) -> bool:
         """Have a compiler read `text` and write all of `target`, or nothing; return whether it is there.
+
+        It is not where it is not true to its `function`.
 
         The file `spent` is removed before the target is there. See :meth:`_compile` for `library`.
         """
@@ -219,6 +262,9 @@ class Builder:
                         if spent is not None:
                             spent.unlink(missing_ok=True)
                             digest_file(spent).unlink(missing_ok=True)
+                        if function is not None and not is_true_to(function, made):
+                            self.erred = True
+                            break
                         _publish(made, target)
                 finally:
                     shutil.rmtree(folder, ignore_errors=True)
@@ -309,4 +355,4 @@ def main() -> int:
             with contextlib.suppress(OSError, RuntimeError):
                 builder.build(job)
     builder.finish()
-    return HUNG if builder.hung else 0
+    return HUNG if builder.hung else WRONG if builder.erred else 0

@@ -67,8 +67,8 @@ QUICK = ("-O1",)
 OWN = ("-O3", "-fno-signed-zeros", "-fassociative-math")
 """Flags for our own C: sums may be vectorised; NaN and infinity keep their meaning."""
 
-HUNG = 3
-"""Exit code of a builder whose compiler hung."""
+HUNG, WRONG = 3, 4
+"""Exit codes of a builder whose compiler hung, or made code of other values than its function's."""
 
 _FORM = "1"
 """Version of the libraries that builders make: with another number all of them are made anew."""
@@ -181,13 +181,13 @@ class _Builder:
     ended : threading.Event
     is_lost : bool
         Whether it was stopped, or belongs to the process that this one was forked from.
-    hung : bool
-        Whether its compiler hung.
+    code : int
+        Its exit code; 0 before it has ended.
     """
 
     def __init__(self) -> None:
         self.ended = threading.Event()
-        self.is_lost = self.hung = False
+        self.is_lost, self.code = False, 0
         self._is_open = True
         self._process: subprocess.Popen[bytes] | None = None
         self._jobs: queue.SimpleQueue[Any] = queue.SimpleQueue()
@@ -213,7 +213,7 @@ class _Builder:
                     start_new_session=True,
                 )
                 self._feed(self._process)
-                self.hung = self._process.wait() == HUNG
+                self.code = self._process.wait()
         finally:
             with _lock:
                 self._is_open = False
@@ -380,11 +380,16 @@ class Building:
                 self._builder = None
             elif has_ended:
                 self.is_settled = True
-                if builder.hung:
+                fault = ""
+                if builder.code == HUNG:
                     _hanging.add(self._job["cc"])
+                    fault = f"did not end within {PATIENCE:g} s: kernels run"
+                elif builder.code == WRONG:
+                    fault = "made code that has wrong values, which is not used: some kernels run"
+                if fault:
                     _warn(
-                        f"the C compiler {self._job['cc']} did not end within {PATIENCE:g} s: kernels run uncompiled, "
-                        "4 to 10 times slower; VGTM_CC names another compiler"
+                        f"the C compiler {self._job['cc']} {fault} uncompiled, 4 to 10 times slower; "
+                        "VGTM_CC names another compiler"
                     )
 
     def _load(self) -> bool:
