@@ -27,3 +27,14 @@ static inline int call(const Kernel *kernel)
     return kernel->eval(kernel->arg, kernel->res, kernel->iw, kernel->w, 0);
 }
 
+static double dot(const double *a, const double *b, int count)
+{
+    double sum = 0.0;
+    for (int k = 0; k < count; k++) sum += a[k] * b[k];
+    return sum;
+}
+
+static double norm(const double *a, int count)
+{
+    return sqrt(dot(a, a, count));
+}

@@ -71,6 +71,10 @@ typedef struct {
     double *constraint, *lower, *upper;        /* (rows, n), (n + rows) */
     int *sense;
     double *x, *multipliers;                   /* (n), (n + rows) */
+    Working *working;
+    /* Of each unknown and row: -1 where it is at its lower bound, 1 where at its upper one, else 0; its column in the
+       working set, or -1. */
+    int *side, *column, *at;                   /* and the unknowns that settling holds, (n) */
 
     double *q, *points;                        /* what close and missing read: q, and (V, 3) */
     double *gone;                              /* (1) */
@@ -83,21 +87,13 @@ typedef struct {
     double member, tip, start, enough_length, enough_tip;
 
     double primal, dual, reached, furthest, off;
-    int flag, iterations;
+    int flag, iterations, held;
     double *work;
 } Fused;
 
-static double dot(const double *a, const double *b, int count)
-{
-    double sum = 0.0;
-    for (int k = 0; k < count; k++) sum += a[k] * b[k];
-    return sum;
-}
-
-static double norm(const double *a, int count)
-{
-    return sqrt(dot(a, a, count));
-}
+/* Working sets that are tried before DAQP; a multiplier that is no rounding, and residuals of a good answer. */
+enum { GUESSES = 4 };
+static const double WILL = 1e-12, GOOD = 1e-11;
 
 /* Numbers that sum up nodes: their number, places (3), products of these (xx, xy, xz, yy, yz, zz), known motions (3) and
    the moments of these (3). */
@@ -423,6 +419,7 @@ static void constrain(Fused *f)
         memset(row + count, 0, sizeof(double) * (n - count));
         memcpy(row, sum + 1, sizeof(double) * count);
         *lower = f->near_lower[k] - sum[0];
+        f->column[n + f->tips + f->hard + f->legs + k] = -1;
     }
 }
 
@@ -457,7 +454,92 @@ EXPORT int assemble(Fused *f)
     if (call(&f->condense)) return NO_VALUE;
     compose(f);
     objective(f);
+    f->working->is_begun = 0;
     return DONE;
+}
+
+/* Whether the QP's Hessian and equalities are in the working set's columns. */
+static int begun(Fused *f)
+{
+    Working *w = f->working;
+    if (w->is_begun) return w->is_begun > 0;
+    for (int k = 0; k < f->unknowns + f->tips + f->hard + f->legs + f->near; k++) f->column[k] = -1;
+    w->is_begun = begin(w, f->hessian, f->gradient, f->constraint, f->levers, f->tips + f->hard) ? 1 : -1;
+    return w->is_begun > 0;
+}
+
+/* The column of an unknown, or of n plus the number of a row behind the equalities; -1 if there is no room. */
+static int column_of(Fused *f, int k)
+{
+    int n = f->unknowns;
+    if (f->column[k] >= 0) return f->column[k];
+    if (k < n) memset(f->working->point, 0, sizeof(double) * n);
+    else memcpy(f->working->point, f->constraint + (k - n) * n, sizeof(double) * n);
+    if (k < n) f->working->point[k] = 1.0;
+    return f->column[k] = extend(f->working, k < n ? k : 0);
+}
+
+/* Change the sides of what is in the working set against its will, and of what is beyond its bounds; return whether
+   there are such. */
+static int reconsider(Fused *f, int rows)
+{
+    int n = f->unknowns, equal = n + f->tips + f->hard, has_changed = 0;
+    for (int k = 0; k < n + rows; k++) {
+        if (k >= n && k < equal) continue;
+        double value = k < n ? f->x[k] : dot(f->constraint + (k - n) * n, f->x, n);
+        int side = f->side[k];
+        if (f->lower[k] == f->upper[k]) continue;
+        if (side && side * f->multipliers[k] < -WILL) f->side[k] = 0;
+        else if (!side && value < f->lower[k] - f->feasibility) f->side[k] = -1;
+        else if (!side && value > f->upper[k] + f->feasibility) f->side[k] = 1;
+        has_changed |= f->side[k] != side;
+    }
+    return has_changed;
+}
+
+/* Solve the QP from the working set of the one before; 0 where that and some changes of it do not lead to the answer. */
+static int guess(Fused *f, int rows)
+{
+    Working *w = f->working;
+    int n = f->unknowns, m = f->tips + f->hard, every = n + rows;
+    if (!begun(f)) return 0;
+    for (int k = 0; k < every; k++) {
+        double y = f->multipliers[k];
+        f->side[k] = f->lower[k] == f->upper[k] ? 1 : (y > 0.0) - (y < 0.0);
+    }
+    for (int count = 1; count <= GUESSES; count++) {
+        int size = 0;
+        for (int k = 0; k < every; k++) {
+            if (k == n) {
+                for (int i = 0; i < m; i++, size++) {
+                    w->chosen[size] = i;
+                    w->share[size] = -f->levers[i] * f->lower[n + i] - w->along[i];
+                }
+                k += m;
+                if (k == every) break;
+            }
+            if (!f->side[k]) continue;
+            int column = size < n ? column_of(f, k) : -1;
+            if (column < 0) return 0;
+            w->chosen[size] = column;
+            w->share[size++] = -(f->side[k] < 0 ? f->lower[k] : f->upper[k]) - w->along[column];
+        }
+        if (!choose(w, size)) return 0;
+        combine(w, size, 1.0);
+        memset(f->multipliers, 0, sizeof(double) * every);
+        for (int k = 0; k < n; k++) f->x[k] = -w->point[k];
+        for (int k = 0; k < every; k++) {
+            if (k >= n && k < n + m) f->multipliers[k] = f->levers[k - n] * w->spread[k - n];
+            else if (f->side[k]) f->multipliers[k] = w->spread[f->column[k]];
+            if (k < n && f->side[k]) f->x[k] = f->side[k] < 0 ? f->lower[k] : f->upper[k];
+        }
+        if (reconsider(f, rows)) continue;
+        f->iterations = count;
+        f->flag = 1;
+        residuals(f, rows);
+        return f->primal <= f->feasibility * sqrt((double)every) && f->dual <= GOOD;
+    }
+    return 0;
 }
 
 /* Solve the QP that was assembled with its rows of clearance. */
@@ -470,6 +552,7 @@ static int answer(Fused *f)
         if (code == DONE) residuals(f, rows);
         return code;
     }
+    if (guess(f, rows)) return DONE;
     DAQPProblem problem = {f->unknowns, f->unknowns + rows, f->unknowns, f->hessian, f->gradient,
                            f->constraint, f->upper, f->lower, f->sense};
     DAQPSettings settings;
@@ -540,78 +623,48 @@ static void advance(Fused *f, const double *x, int whole)
     for (int k = 0; k < f->torsion; k++) f->torsions[k] += free[1 + 3 * (f->vertices - 2) + k];
 }
 
-/* In place, the Cholesky factor of A (n, n) below its diagonal, whose inverse is on it; 0 if A is not positive definite. */
-static int factorise(double *A, int n)
+/* Work with the bounds that the answer is at, whose unknowns settling does not change, and all equalities; 0 if these
+   do not determine the least changes. See settling_gain. */
+static int hold(Fused *f)
 {
-    for (int j = 0; j < n; j++) {
-        double pivot = A[j * n + j] - dot(A + j * n, A + j * n, j);
-        if (!(pivot > 0.0)) return 0;
-        pivot = 1.0 / sqrt(pivot);
-        A[j * n + j] = pivot;
-        for (int i = j + 1; i < n; i++) A[i * n + j] = (A[i * n + j] - dot(A + i * n, A + j * n, j)) * pivot;
+    Working *w = f->working;
+    int n = f->unknowns, m = f->tips + f->hard, size = 0, is_same = 1, column;
+    if (!begun(f)) return 0;
+    for (int k = 0; k < n; k++) {
+        if (k < n - 1
+            && (k >= f->actuators || (f->x[k] > f->lower[k] + f->at_bound && f->x[k] < f->upper[k] - f->at_bound)))
+            continue;
+        if ((column = column_of(f, k)) < 0) return 0;
+        is_same &= size < w->size && w->chosen[size] == column;
+        f->at[size] = k;
+        w->chosen[size++] = column;
     }
-    return 1;
-}
-
-/* The gain of settling_gain in factors: L of the Hessian of the free unknowns, half = rows L^-T, and the factor of
-   half half^T. */
-typedef struct {
-    int free, *of;
-    double *factor, *half, *normal;
-} Gain;
-
-static int gain_of(Fused *f, Gain *g, double *work)
-{
-    int n = f->unknowns, m = f->tips + f->hard, last = n - 1, free = 0;
-    g->factor = work;
-    g->half = work + n * n;
-    g->normal = g->half + m * n;
-    g->of = (int *)(g->normal + m * m);
-    for (int k = 0; k < last; k++)
-        if (k >= f->actuators || (f->x[k] > f->lower[k] + f->at_bound && f->x[k] < f->upper[k] - f->at_bound))
-            g->of[free++] = k;
-    g->free = free;
-    if (free < m) return 0;
-    for (int i = 0; i < free; i++)
-        for (int j = 0; j <= i; j++) g->factor[i * free + j] = f->hessian[g->of[i] * n + g->of[j]];
-    if (!factorise(g->factor, free)) return 0;
+    f->held = size;
     for (int k = 0; k < m; k++) {
-        double *half = g->half + k * free;
-        for (int i = 0; i < free; i++)
-            half[i] = (f->levers[k] * f->constraint[k * n + g->of[i]] - dot(g->factor + i * free, half, i))
-                * g->factor[i * free + i];
+        is_same &= size < w->size && w->chosen[size] == k;
+        w->chosen[size++] = k;
     }
-    for (int i = 0; i < m; i++)
-        for (int j = 0; j <= i; j++) g->normal[i * m + j] = dot(g->half + i * free, g->half + j * free, free);
-    if (!factorise(g->normal, m)) return 0;
+    /* What follows in the set does not change the factor so far. */
+    if (!is_same && !choose(w, size)) return 0;
     double least = INFINITY, greatest = 0.0;
-    for (int i = 0; i < m; i++) {
-        least = fmin(least, g->normal[i * m + i]);
-        greatest = fmax(greatest, g->normal[i * m + i]);
+    for (int i = f->held; i < size; i++) {
+        least = fmin(least, w->inner[i * w->most + i]);
+        greatest = fmax(greatest, w->inner[i * w->most + i]);
     }
     /* Of the inverses of the pivots. */
     return greatest * greatest < f->worst_condition * least * least;
 }
 
-/* The least changes (n) of the unknowns that correct the errors `missing` (m). */
-static void change_by(const Fused *f, const Gain *g, const double *missing, double *change, double *work)
+/* The least changes (n) of the unknowns that correct the errors `missing` (m) and leave those that are held. */
+static void change_by(const Fused *f, const double *missing, double *change)
 {
-    int n = f->unknowns, m = f->tips + f->hard, free = g->free;
-    double *shares = work, *part = work + m;
-    for (int i = 0; i < m; i++)
-        shares[i] = (f->levers[i] * missing[i] - dot(g->normal + i * m, shares, i)) * g->normal[i * m + i];
-    memset(part, 0, sizeof(double) * free);
-    for (int i = m - 1; i >= 0; i--) {
-        shares[i] *= g->normal[i * m + i];
-        for (int j = 0; j < i; j++) shares[j] -= g->normal[i * m + j] * shares[i];
-        for (int k = 0; k < free; k++) part[k] += shares[i] * g->half[i * free + k];
-    }
-    memset(change, 0, sizeof(double) * n);
-    for (int i = free - 1; i >= 0; i--) {
-        part[i] *= g->factor[i * free + i];
-        for (int j = 0; j < i; j++) part[j] -= g->factor[i * free + j] * part[i];
-        change[g->of[i]] = part[i];
-    }
+    Working *w = f->working;
+    int m = f->tips + f->hard;
+    memset(w->share, 0, sizeof(double) * f->held);
+    for (int i = 0; i < m; i++) w->share[f->held + i] = f->levers[i] * missing[i];
+    combine(w, f->held + m, 0.0);
+    memcpy(change, w->point, sizeof(double) * f->unknowns);
+    for (int k = 0; k < f->held; k++) change[f->at[k]] = 0.0;
 }
 
 /* Settle q and the curve: quantities exact, equalities satisfied. Each iteration closes the quantities by a step of
@@ -621,8 +674,6 @@ EXPORT int settle(Fused *f)
 {
     int n = f->unknowns, m = f->tips + f->hard, steps = 0, may_correct = 1, is_measured = 0;
     double *step = f->work + f->nodes + SUMS * (f->actuators + 1) + n * f->squares;
-    double *work = step + (f->settling_steps + 1) * n;
-    Gain gain;
     for (int count = 0; count <= f->closing_steps + f->settling_steps; count++) {
         if (call(&f->close)) return UNSETTLED;
         /* The norm is NaN if one of the errors is. */
@@ -638,13 +689,13 @@ EXPORT int settle(Fused *f)
         f->off = sqrt(f->off);
         if (!(f->off <= f->start)) return UNSETTLED;
         is_measured = 1;
-        if (!steps && f->off > f->enough_tip) may_correct = gain_of(f, &gain, work);
+        if (!steps && f->off > f->enough_tip) may_correct = hold(f);
         if (f->off <= f->enough_tip || !may_correct || steps == f->settling_steps) {
             if (is_closed) break;
             continue;
         }
         double *next = step + steps * n;
-        change_by(f, &gain, f->missed, next, work + n * n + m * (n + m) + n);
+        change_by(f, f->missed, next);
         for (int k = 0; k < steps; k++) {
             const double *before = step + k * n;
             double share = dot(before, next, n) / dot(before, before, n);

@@ -404,7 +404,7 @@ class FusedWorkspace:
         self._response = np.zeros((nodes, 1 + self.actuators))
         self.stack = np.zeros((size, rows))
         sums = 16 * (self.actuators + 1)
-        work = nodes + sums + size * (rows + size + equal + SETTLING_STEPS + 4) + equal * (equal + 1)
+        work = nodes + sums + size * (rows + SETTLING_STEPS + 2)
         self._program = Program("Fused")
         self._program.set(**_numbers(layout), **_daqp(), unknowns=size)
         # The bounds are written where the QP has them.
@@ -439,6 +439,8 @@ class FusedWorkspace:
             started=self.started,
             started_points=self.started_points,
             work=np.zeros(work),
+            working=self._working(size).address,
+            at=np.zeros(size, dtype=np.int32),
             close=close,
             missing=missing,
         )
@@ -446,6 +448,26 @@ class FusedWorkspace:
             self._callback = ctypes.CFUNCTYPE(ctypes.c_int)(self._ask)
             self._program.set(other=ctypes.cast(self._callback, ctypes.c_void_p).value)
         self._reserve(_ROOM, _SLOTS)
+
+    def _working(self, size: int) -> Program:
+        """Return the C's working set of QPs of that size."""
+        most = 2 * size
+        columns, products, inner = np.zeros((size, most)), np.zeros((most, most)), np.zeros((most, most))
+        vectors = {name: np.zeros(most) for name in ("along", "share", "spread")}
+        self._set = Program("Working")
+        self._set.set(
+            unknowns=size,
+            most=most,
+            factor=np.zeros((size, size)),
+            columns=columns,
+            products=products,
+            inner=inner,
+            pull=np.zeros(size),
+            point=np.zeros(size),
+            chosen=np.zeros(most, dtype=np.int32),
+            **vectors,
+        )
+        return self._set
 
     def _reserve(self, near: int, slots: int) -> None:
         """Make room for `near` rows of clearance over `slots` nodes each."""
@@ -468,6 +490,8 @@ class FusedWorkspace:
             lower=self.lower,
             upper=self.upper,
             sense=self._sense,
+            side=np.zeros(size + rows, dtype=np.int32),
+            column=np.zeros(size + rows, dtype=np.int32),
             multipliers=self.multipliers,
             condense=self.condense,
         )
