@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from vgtm_qp.arm.joint_space import JointSpaceArm
 from vgtm_qp.arm.symbols import Constants, EliminationStage
-from vgtm_qp.arrays import Array, Index
+from vgtm_qp.arrays import Array, Index, record
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.errors import EvaluationError
 from vgtm_qp.native import Code, Program, building
@@ -212,7 +212,8 @@ class FusedSolver:
     def _solution(self, x: Array, near: int, nodes: Array, vertices: Array) -> StepSolution:
         work, x = self.workspace, x.copy()
         count, first = work.actuators, work.size + work.first_near
-        return StepSolution(
+        return record(
+            StepSolution,
             nodes=nodes,
             actuators=x[:count],
             vertices=vertices,
@@ -221,6 +222,7 @@ class FusedSolver:
             clearance_multipliers=-work.multipliers[first : first + near],
             iterations=work.data.iterations,
             torsion=x[work.torsion : -1],
+            tip_slack=0.0,
         )
 
 
@@ -395,7 +397,7 @@ class FusedWorkspace:
             close.bind_input(argument, shared)
         self.q, self.points, self.gone = missing.inputs[0], missing.inputs[3], missing.inputs[common]
         self.started, self.started_points = self.q.copy(), self.points.copy()
-        size, equal, nodes = self.size, self.equal, layout.node_columns
+        size, nodes = self.size, layout.node_columns
         rows = layout.least_squares - (0 if self._movers is None else nodes)
         self.hessian, self.gradient, self.x = np.zeros((size, size)), np.zeros(size), np.zeros(size)
         found = dict(zip(RESULTS, condense.outputs, strict=False))

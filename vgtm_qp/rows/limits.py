@@ -24,12 +24,39 @@ def braking_speed(distance: Array, acceleration: Array, dt: float) -> Array:
     return np.asarray(np.where(np.isfinite(acceleration) & np.isfinite(gap), speed, np.inf))
 
 
+_DOWN_AND_UP = np.array([[-1.0], [1.0]])
+
+APPROACH = 0.3
+"""Largest share of the distance to the end of its stroke that an actuator that slows down uses in one step."""
+
+
+def resting_box(
+    value: Array, ends: Array, travel: Array, least_approach: Array | None
+) -> tuple[Array, Array]:
+    """Return the box of :func:`actuator_box` for actuators without limits of their acceleration.
+
+    Parameters
+    ----------
+    ends : (2, n_a)
+        The least values of the stroke times -1, and the greatest.
+    travel : (n_a,)
+        Greatest changes by the rate.
+    least_approach : (n_a,)
+        Approach to an end of the stroke that is always allowed; the actuators slow down before that. None if they do
+        not.
+    """
+    left = np.maximum(ends - _DOWN_AND_UP * value, 0.0)
+    near = left if least_approach is None else np.maximum(APPROACH * left, np.minimum(left, least_approach))
+    lower, upper = value + _DOWN_AND_UP * np.minimum(near, travel)
+    return lower, upper
+
+
 def actuator_box(
     value: Array,
     speed: Array,
     stroke: Array,
     rate: Array,
-    acceleration: Array | None,
+    acceleration: Array,
     dt: float,
     last_dt: float | None = None,
 ) -> tuple[Array, Array]:
@@ -44,16 +71,13 @@ def actuator_box(
     ----------
     speed : (n_a,)
         Mean speed over the step before, per second.
-    acceleration
-        Limits; None without any.
+    acceleration : (n_a,)
+        Limits; inf without one.
     last_dt
         Duration of that step, s; `dt` by default. An acceleration is a change of mean speed over the time between
         the middles of two steps.
     """
     low, high = np.minimum(stroke[:, 0], value), np.maximum(stroke[:, 1], value)
-    if acceleration is None:
-        travel = rate * dt
-        return np.maximum(low, value - travel), np.minimum(high, value + travel)
     interval = dt if last_dt is None else 0.5 * (dt + last_dt)
     fastest = np.minimum(rate, braking_speed(high - value, acceleration, dt))
     slowest = -np.minimum(rate, braking_speed(value - low, acceleration, dt))

@@ -10,15 +10,12 @@ from numpy.typing import NDArray
 from vgtm_qp.arrays import Array
 from vgtm_qp.errors import GoalError, nearest
 from vgtm_qp.qp.settle import enough_length
-from vgtm_qp.rows.limits import actuator_box, binding
+from vgtm_qp.rows.limits import actuator_box, binding, resting_box
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import State
 
 Box = tuple[Array, Array]
 """Least and greatest values (n_a,) of the actuators after a step."""
-
-_APPROACH = 0.3
-"""Largest share of the distance to the end of its stroke that an actuator may use in one step."""
 
 _LEAST_APPROACH = 2e-3
 """Approach to the end of a stroke that is always allowed in one step: rad, or a share of the arm's unit."""
@@ -101,7 +98,8 @@ class Actuation:
         self._settled = enough_length(arm.home_configuration, self.tolerance)
         self._slows_down = setup.slows_down and self.starts_at_once
         self._least_approach = _LEAST_APPROACH * arm.unit / arm.levers
-        self._pace: tuple[float, Array] = 0.0, self._rate
+        self._ends = _ends(self._stroke)
+        self._pace: tuple[float, Array, Array] = 0.0, self._rate, self._rate
         self.locked: set[str] = set()
         self._held = np.zeros(len(self.names), dtype=bool)
         self._jams = sorted(setup.jams, key=lambda jam: -jam[1])
@@ -127,6 +125,7 @@ class Actuation:
         # New arrays: the limits of earlier steps keep theirs.
         self._stroke, self._held = self._stroke.copy(), self._held.copy()
         self._stroke[k] = self.values(state)[k]
+        self._ends = _ends(self._stroke)
         self._held[k] = True
         self.locked.add(name)
 
@@ -152,17 +151,14 @@ class Actuation:
 
         With `slowing`, actuators slow down before the ends of their strokes, if the problem asks for it.
         """
-        value, stroke, rate = self.values(state), self._stroke, self._paced(dt)
-        limited = None if self.starts_at_once else self._acceleration
-        speed = state.rates.take(self._actuators)
-        lower, upper = actuator_box(value, speed, stroke, rate, limited, dt, state.duration or None)
-        if slowing and self._slows_down:
-            # To the lower ends of the strokes, and to the upper ends.
-            left = np.maximum([value - stroke[:, 0], stroke[:, 1] - value], 0.0)
-            down, up = np.maximum(_APPROACH * left, np.minimum(left, self._least_approach))
-            slow_lower, slow_upper = np.minimum(value - down, upper), np.maximum(value + up, lower)
-            lower, upper = np.maximum(lower, slow_lower), np.minimum(upper, slow_upper)
-        return Limits(lower, upper, self.names, value, rate * dt, stroke, self._acceleration, self._held)
+        value, stroke, (_, rate, travel) = self.values(state), self._stroke, self._paced(dt)
+        if self.starts_at_once:
+            least = self._least_approach if slowing and self._slows_down else None
+            lower, upper = resting_box(value, self._ends, travel, least)
+        else:
+            limits = stroke, rate, self._acceleration, dt, state.duration or None
+            lower, upper = actuator_box(value, state.rates.take(self._actuators), *limits)
+        return Limits(lower, upper, self.names, value, travel, stroke, self._acceleration, self._held)
 
     def creeping(self, state: State, box: Box, dt: float) -> Box | None:
         """Return the part of a box from which every actuator can stop at once; None if there is none."""
@@ -170,11 +166,16 @@ class Actuation:
         lower, upper = np.maximum(box[0], value - reach), np.minimum(box[1], value + reach)
         return (lower, upper) if np.all(lower <= upper) else None
 
-    def _paced(self, dt: float) -> Array:
-        """Return (n_a,) the greatest rates of a step of `dt`, s, less what settling may add."""
+    def _paced(self, dt: float) -> tuple[float, Array, Array]:
+        """Return `dt`, s, the greatest rates (n_a,) of such a step, less what settling may add, and their changes."""
         if dt != self._pace[0]:
             # The error that settling may leave, over the duration, is a rate. In a very short step less is left.
             spare = np.minimum(self.tolerance / dt, _SPARE_RATE * self._rate)
             rate = np.maximum(self._rate - np.maximum(spare, self._settled / dt), 0.0)
-            self._pace = dt, rate
-        return self._pace[1]
+            self._pace = dt, rate, rate * dt
+        return self._pace
+
+
+def _ends(stroke: Array) -> Array:
+    """Return (2, n_a) the least values of strokes (n_a, 2) times -1, and the greatest."""
+    return np.stack([-stroke[:, 0], stroke[:, 1]])

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from vgtm_qp.arrays import Array
+from vgtm_qp.arrays import Array, record
 from vgtm_qp.errors import CurveError, EvaluationError, SolverError
 from vgtm_qp.qp.answer import Accuracy, Closed, Move
 from vgtm_qp.qp.layout import Layout
@@ -340,7 +340,8 @@ class Attempt:
     def _accepted(self, state: State, progress: float, gap: float, **of_qps: Any) -> Step:
         """Return the step to a proven `state` with the `gap` of its stations; `of_qps` are its fields of the QPs."""
         status = StepStatus.REACHED if progress >= WHOLE else StepStatus.SLOWED
-        return Step(status, progress, state, "", gave_way=self._gave_way(gap), gap=gap, **of_qps)
+        known = {"status": status, "progress": progress, "state": state, "reason": "", "gap": gap, **of_qps}
+        return record(Step, gave_way=self._gave_way(gap), **known)
 
     def _flaw(self, state: State, target: Target, move: Move, closed: Closed) -> str:
         """Return the flaw of the configuration of a `move` from `state`, computed again, or nothing."""

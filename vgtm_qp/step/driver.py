@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vgtm_qp.arm.arm import Pose, tip_function
+from vgtm_qp.arrays import record
 from vgtm_qp.geometry.exact import CONTACT, NORMAL_FROM, PROOF
 from vgtm_qp.geometry.pairs import Pair
 from vgtm_qp.geometry.watch import AHEAD, Watch
@@ -44,6 +45,8 @@ DEVIATION = 0.1
 
 PHASES = "distance", "qp", "acceptance"
 """Parts of a step whose times are known."""
+
+_NO_ROWS = ClearanceRows()
 
 _ROOM = 64
 """Capacity at first: rows of clearance."""
@@ -176,7 +179,8 @@ class Driver:
             if layout.hard_tracking and not gap <= self._accuracy.tracking:
                 return None
         time, late = state.after(target.duration)
-        then = State(
+        then = record(
+            State,
             time=time,
             q=q,
             nodes=q if self._is_placed else nodes,
@@ -213,7 +217,7 @@ class Driver:
         """Return the rows of the last QP."""
         near, work = int(self._work.data.near), self._work
         if not near or self._watch is None:
-            return ClearanceRows()
+            return _NO_ROWS
         names, groups = self._setup.monitor.names, [pairs.group for pairs in self._watch.groups]
         group, pair = self._group[:near].copy(), self._pair[:near].copy()
 

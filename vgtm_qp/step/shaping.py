@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vgtm_qp.arrays import Array
+from vgtm_qp.arrays import Array, record
 from vgtm_qp.curve.curve import Curve
 from vgtm_qp.curve.families import CurveFamily
 from vgtm_qp.curve.redundancy import Refit, add_control_vertices, remove_control_vertices
@@ -40,7 +40,18 @@ class Shaping:
     def target(self, state: State, dt: float, path: Path, start: float, end: float, box: Box) -> Target:
         """Return the target of a step of `dt`, s, from `state` over the values `start` to `end` of a path."""
         then, _ = state.after(dt)
-        return Target(path, start, end, *box, then, dt, self.setup.base_at(then), self._places)
+        return record(
+            Target,
+            path=path,
+            start=start,
+            end=end,
+            lower=box[0],
+            upper=box[1],
+            time=then,
+            duration=dt,
+            base=self.setup.base_at(then),
+            vertex_goals=self._places,
+        )
 
     @property
     def goals(self) -> dict[int, Array]:

@@ -9,6 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
+from vgtm_qp.arrays import record
 from vgtm_qp.notebook import html_table
 from vgtm_qp.qp.answer import StepSolution
 from vgtm_qp.qp.full import StepQP
@@ -107,11 +108,9 @@ class Step:
         status, progress = self.status, share * self.progress
         if self.moved:
             status = StepStatus.REACHED if progress >= WHOLE else StepStatus.SLOWED
-        # Its own way of copying: `replace` costs a control loop as much as a row of its QP.
-        other = object.__new__(Step)
-        vars(other).update(vars(self), status=status, progress=progress, limits=limits)
-        vars(other).pop("multipliers", None)
-        return other
+        fields = {**vars(self), "status": status, "progress": progress, "limits": limits}
+        fields.pop("multipliers", None)
+        return record(Step, **fields)
 
     @property
     def moved(self) -> bool:
