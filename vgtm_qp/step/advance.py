@@ -60,6 +60,7 @@ class Advancer:
         self._attempt, self._actuation, self._shaping = attempt, actuation, shaping
         self._tip_mode, self._step_limit = shaping.setup.tip_mode, shaping.setup.step_limit
         self._arm = shaping.setup.arm
+        self._may_be_usual = actuation.starts_at_once and not self._step_limit < np.inf
 
     def brakes(self, dt: float) -> Brakes:
         """Return how the arm brakes in steps of `dt`, s."""
@@ -75,6 +76,10 @@ class Advancer:
         """
         best: Advance | None = None
         too_long, before = "", self._attempt.qps
+        if self._may_be_usual and (usual := self._attempt.usual(state, target)) is not None:
+            held = _LEAST_HELD if self._attempt.gives_way else 0.0
+            if usual.progress >= (held if self._tip_mode == "scaled" else WHOLE):
+                return Advance(usual, None)
         for found in self._attempts(state, target, dt, smallest):
             if found.step.reason.startswith(TOO_LONG):
                 too_long = found.step.reason

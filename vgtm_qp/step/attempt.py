@@ -68,8 +68,22 @@ class Phases:
     """Seconds spent in each phase of a step, by name."""
 
     def __init__(self, *names: str) -> None:
-        self.seconds = dict.fromkeys(names, 0.0)
+        self._seconds = dict.fromkeys(names, 0.0)
+        self._others: list[tuple[Sequence[str], Array]] = []
         self.start()
+
+    @property
+    def seconds(self) -> dict[str, float]:
+        """Seconds so far by name; may be changed in place."""
+        for phases, spent in self._others:
+            for phase, seconds in zip(phases, spent.tolist(), strict=True):
+                self._seconds[phase] += seconds
+            spent[:] = 0.0
+        return self._seconds
+
+    def join(self, phases: Sequence[str], spent: Array) -> None:
+        """Count from now on the seconds that others add to `spent` for some phases, too."""
+        self._others.append((phases, spent))
 
     def start(self) -> None:
         """Begin to count."""
@@ -78,15 +92,8 @@ class Phases:
     def add(self, phase: str) -> None:
         """Add the time since the last call to `phase`."""
         now = perf_counter()
-        self.seconds[phase] += now - self._mark
+        self._seconds[phase] += now - self._mark
         self._mark = now
-
-    def take(self, phases: Sequence[str], spent: Array) -> None:
-        """Add the seconds `spent` in some phases, which are set to zero, and begin to count anew."""
-        for phase, seconds in zip(phases, spent.tolist(), strict=True):
-            self.seconds[phase] += seconds
-        spent[:] = 0.0
-        self.start()
 
 
 class Attempt:
@@ -111,6 +118,7 @@ class Attempt:
         self.acceptance = Acceptance(setup, self.accuracy)
         # Each curve has engines of its own, which are kept as well: see ``Shaping``.
         self._drivers: dict[Engine, Driver] = {}
+        self._tried: tuple[State, Target, Step | Begun | None] | None = None
         self.use(setup)
 
     def use(self, setup: Setup) -> None:
@@ -121,6 +129,15 @@ class Attempt:
     def gives_way(self) -> bool:
         """Whether stations may leave the curve where they block the arm."""
         return self._setup.elastic is not None
+
+    def usual(self, state: State, target: Target) -> Step | None:
+        """Return the step of :meth:`run` if it is a usual one, in one call; what was found out is kept for ``run``."""
+        engine, self._tried = self._setup.engine, None
+        if not self._can_drive or self.separation.shortfall_of(state) or not isinstance(engine, FusedEngine):
+            return None
+        driven = self._driven(state, target, 1.0, engine)
+        self._tried = state, target, driven
+        return driven if isinstance(driven, Step) else None
 
     def run(
         self,
@@ -157,16 +174,19 @@ class Attempt:
         engine: Engine,
     ) -> Step:
         """Return an engine's step that drives apart pairs too near, or if that fails keeps their distance."""
-        short, begun = self.separation.shortfall_of(state), None
-        if self._can_drive and not short and progress == 0.0 and isinstance(engine, FusedEngine):
+        short = self.separation.shortfall_of(state)
+        tried, self._tried = self._tried, None
+        driven: Step | Begun | None = None
+        if tried is not None and tried[:2] == (state, target) and engine is self._setup.engine:
+            driven = tried[2]
+        elif self._can_drive and not short and progress == 0.0 and isinstance(engine, FusedEngine):
             driven = self._driven(state, target, share, engine)
-            if isinstance(driven, Step):
-                return driven
-            begun = driven
+        if isinstance(driven, Step):
+            return driven
         for gain in (self._recovery(short), 0.0) if short else (0.0,):
             try:
-                if begun is not None:
-                    step = self._run(state, target, begun, begun.reach, short, gain, engine)
+                if driven is not None:
+                    step = self._run(state, target, driven, driven.reach, short, gain, engine)
                 else:
                     asked, reach = self._first(state, target, share, progress, short, gain)
                     step = self._run(state, target, asked, reach, short, gain, engine)
@@ -182,9 +202,10 @@ class Attempt:
         driver = self._drivers.get(engine)
         if driver is None:
             driver = self._drivers[engine] = Driver(self._setup, engine, self.accuracy, self.separation)
+            self.phases.join(PHASES, driver.spent)
         taken = driver.take(state, target, share)
-        self.phases.take(PHASES, driver.spent)
         if not isinstance(taken, Passage):
+            self.phases.start()
             return taken
         self.qps += 1
         of_qp = {"qps": 1, "solution": taken.solution, "rows": taken.rows}
