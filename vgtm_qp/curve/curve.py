@@ -144,7 +144,9 @@ class Curve:
         goal = fraction.ravel() * lengths[-1]
         cell = np.clip(np.searchsorted(lengths, goal, side="right") - 1, 0, len(cells) - 2)
         low, high = cells[cell], cells[cell + 1]
-        s, step = (low + high) / 2, high - low
+        # The speed changes little within a cell.
+        share = (goal - lengths[cell]) / np.maximum(lengths[cell + 1] - lengths[cell], np.finfo(float).tiny)
+        s, step = low + np.clip(share, 0.0, 1.0) * (high - low), high - low
         for _ in range(_NEWTON_STEPS):
             excess, speed = self.length(s) - goal, np.linalg.norm(self.derivative(s), axis=-1)
             low, high = np.where(excess < 0, s, low), np.where(excess < 0, high, s)
