@@ -373,7 +373,8 @@ def test_every_row_that_presses_is_proven_and_lies_change_no_step(untruth, probl
             third = lied.step(position=goal)
         assert third.fcl_rows == 0
         assert np.count_nonzero(third.solution.clearance_multipliers) <= third.exact_rows <= len(third.rows)
-        np.testing.assert_array_equal(third.state.nodes, other.state.nodes)
+        # The QPs are the same, but begin with the working sets of others.
+        np.testing.assert_allclose(third.state.nodes, other.state.nodes, atol=1e-8)
         np.testing.assert_allclose(step.state.nodes, other.state.nodes, atol=1e-6)
         assert step.status == other.status == third.status
     assert honest.state.time > 0.0

@@ -235,7 +235,7 @@ class Clearance:
         for group in self._candidates.groups:
             least = self_floor if group.is_self else floor
             rows = np.flatnonzero(~(group.lower(motion, least)[0] >= least))
-            if len(rows) and not (group.distances(X, time, rows) >= least).all():
+            if len(rows) and not (group.distances(X, time, rows, least) >= least).all():
                 return False
         return not self._solids.enclosed(X, time)
 

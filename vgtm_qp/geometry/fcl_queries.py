@@ -23,6 +23,9 @@ from vgtm_qp.geometry.shapes import ObstaclePieces
 _UNITS = 1e5
 """FCL's units in a unit of length; its iterations end at 1e-6, which of 1 m turns normals by 1e-3 rad."""
 
+_POLAR_STEPS, _ROUNDING = 8, 4e-15
+"""Most steps to the rotation nearest to a frame; error of one by rounding alone."""
+
 _TRIANGLE = np.array([3, 0, 1, 2, 3, 0, 2, 1])
 """Both sides of a triangle as faces: FCL measures distances to convex sets, but not to its own triangles."""
 
@@ -148,9 +151,7 @@ class FclQueries:
         """Return for each body the rotation and the position (3, 4) of its hull for `points` (K, 4, 3), m."""
         corners, inverse = self._corners[bodies, :, None], self._inverse[bodies]
         edges = np.swapaxes(points[:, 1:] - points[:, :1], 1, 2)
-        # Between two states points go straight, so that their frame is a rotation only nearly.
-        u, _, v = np.linalg.svd(edges @ inverse)
-        turn = u @ v
+        turn = _rotations(edges @ inverse)
         position = self.scale * (points.mean(axis=1)[..., None] - turn @ corners)
         return list(np.concatenate([turn, position], axis=2))
 
@@ -189,6 +190,21 @@ def _hull(hull: Hull, scale: float) -> fcl.CollisionObject:
     """Return a hull in FCL's units."""
     faces = np.insert(hull.faces, 0, 3, axis=1).ravel()
     return fcl.CollisionObject(fcl.Convex(scale * hull.vertices, len(hull.faces), faces), fcl.Transform())
+
+
+def _rotations(frames: Array) -> Array:
+    """Return the rotations (K, 3, 3) nearest to `frames`: those of points that go straight are only nearly so."""
+    # Newton's iteration for the polar factor, which doubles the digits; far from rotations it may not converge.
+    for _ in range(_POLAR_STEPS):
+        square = np.swapaxes(frames, 1, 2) @ frames
+        off = np.abs(square - np.eye(3)).max(initial=0.0)
+        if off < _ROUNDING:
+            return frames
+        if not off < 0.5:
+            break
+        frames = frames @ (1.5 * np.eye(3) - 0.5 * square)
+    u, _, v = np.linalg.svd(frames)
+    return np.asarray(u @ v)
 
 
 def _axes(first: Array, second: Array) -> tuple[list[Array], list[list[float]]]:

@@ -275,7 +275,7 @@ class Group:
         """Return ``sweep_function`` (k, 3) of pairs, as given by :meth:`at`, that move from `start` to `end`."""
         return self.scene.batch(sweep_function, self.shape)(start, end)
 
-    def distances(self, X: Array, time: float, rows: Index) -> Array:
+    def distances(self, X: Array, time: float, rows: Index, enough: float = np.inf) -> Array:  # noqa: ARG002
         """Return exact surface distances (k,) of some pairs, m."""
         return self._distances(self.at(X, time, rows))[:, 0]
 

@@ -8,6 +8,7 @@ disagree, the normal is computed from convex combinations of points of both bodi
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from scipy.optimize import nnls
@@ -93,18 +94,19 @@ class HullGroup(Group):
         found[:, :, 0] -= np.where(found[:, :, 0] < FAR, pairs[:, -2, None], 0.0)
         return found
 
-    def distances(self, X: Array, time: float, rows: Index) -> Array:
+    def distances(self, X: Array, time: float, rows: Index, enough: float = np.inf) -> Array:
         """Return surface distances (k,) of some pairs, m; below zero where they overlap.
 
-        The least one is exact; others may be too small by the error of FCL's answers that are proven.
+        The least one is exact if it is not `enough`; others may be too small by the error of FCL's answers that are
+        proven.
         """
-        return self._in_parts(self._distances_of, self.at(X, time, rows))
+        return self._in_parts(partial(self._distances_of, enough), self.at(X, time, rows))
 
-    def _distances_of(self, pairs: Array) -> Array:
+    def _distances_of(self, enough: float, pairs: Array) -> Array:
         sides = _Sides(self, pairs)
         _, _, normal, proven = self._witnesses(pairs, sides)
         found = sides.gaps(normal) - pairs[:, -2]
-        nearest = found <= found.min(initial=np.inf) + 2.0 * PROOF * self.scene.unit
+        nearest = found <= min(found.min(initial=np.inf) + 2.0 * PROOF * self.scene.unit, enough)
         for k in np.flatnonzero(proven & nearest).tolist():
             normal[k] = self._computed(sides, k, normal[k])[2]
         return np.asarray(sides.gaps(normal) - pairs[:, -2])
