@@ -458,13 +458,17 @@ EXPORT int assemble(Fused *f)
     return DONE;
 }
 
-/* Whether the QP's Hessian and equalities are in the working set's columns. */
+/* Whether the QP's Hessian and equalities are in the working set's columns; there is room for as many as unknowns then.
+   Without room all others are forgotten. */
 static int begun(Fused *f)
 {
     Working *w = f->working;
-    if (w->is_begun) return w->is_begun > 0;
-    for (int k = 0; k < f->unknowns + f->tips + f->hard + f->legs + f->near; k++) f->column[k] = -1;
-    w->is_begun = begin(w, f->hessian, f->gradient, f->constraint, f->levers, f->tips + f->hard) ? 1 : -1;
+    int m = f->tips + f->hard, is_full = w->count + f->unknowns > w->most;
+    if (w->is_begun && !is_full) return w->is_begun > 0;
+    for (int k = 0; k < f->unknowns + m + f->legs + f->near; k++) f->column[k] = -1;
+    if (!w->is_begun) w->is_begun = begin(w, f->hessian, f->gradient, f->constraint, f->levers, m) ? 1 : -1;
+    w->count = m;
+    w->size = 0;
     return w->is_begun > 0;
 }
 

@@ -48,7 +48,7 @@ static void solve_upper(const double *U, int n, int stride, double *b)
         b[j] = (b[j] - dot(U + j * stride + j + 1, b + j + 1, n - j - 1)) * U[j * stride + j];
 }
 
-/* Begin with H, g and the first rows (m, n), each times its lever; 0 if H is not positive definite. */
+/* Begin with H, g and, as its columns, the rows (m, n), each times its lever; 0 if H is not positive definite. */
 static int begin(Working *w, const double *H, const double *g, const double *rows, const double *levers, int m)
 {
     int n = w->unknowns, most = w->most;
@@ -75,8 +75,6 @@ static int begin(Working *w, const double *H, const double *g, const double *row
     }
     for (int i = 0; i < m; i++)
         for (int k = 0; k < i; k++) w->products[i * most + k] = w->products[k * most + i];
-    w->count = m;
-    w->size = 0;
     return 1;
 }
 

@@ -453,7 +453,7 @@ class FusedWorkspace:
 
     def _working(self, size: int) -> Program:
         """Return the C's working set of QPs of that size."""
-        most = 2 * size
+        most = 3 * size
         columns, products, inner = np.zeros((size, most)), np.zeros((most, most)), np.zeros((most, most))
         vectors = {name: np.zeros(most) for name in ("along", "share", "spread")}
         self._set = Program("Working")
@@ -493,7 +493,7 @@ class FusedWorkspace:
             upper=self.upper,
             sense=self._sense,
             side=np.zeros(size + rows, dtype=np.int32),
-            column=np.zeros(size + rows, dtype=np.int32),
+            column=np.full(size + rows, -1, dtype=np.int32),
             multipliers=self.multipliers,
             condense=self.condense,
         )
