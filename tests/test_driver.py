@@ -17,7 +17,7 @@ from vgtm_qp.native import building
 from vgtm_qp.problem.obstacle import Sphere
 from vgtm_qp.qp import fused
 from vgtm_qp.rotation import rotation_from_vector, vector_from_rotation
-from vgtm_qp.step.driver import Driver, Passage
+from vgtm_qp.step.driver import Begun, Driver, Lost, Passage
 from vgtm_qp.step.path import Path
 from vgtm_qp.study.scenes import random_scene
 from vgtm_qp.study.serial_scenes import random_serial_scene
@@ -119,11 +119,87 @@ def test_it_takes_the_steps_of_random_arms(number, driven, rng):
         compare(serial, rng, 8, SAME)
 
 
+def problem_of_two_qps(name: str, **changes: object) -> vq.Problem:
+    """A problem in which steps towards far goals need further QPs; contacts by closed forms, which are exact."""
+    problem = CASES[name].load() if name in CASES else vq.load_problem(name)
+    return problem.replace({"clearance.distance": "exact", **changes})
+
+
+FURTHER = {
+    "octahedral": ("octahedral 5", {"method.tracking_mode": "exact"}),
+    "octahedral, elastic": ("octahedral 4, far goal", {}),
+    "double-octahedral": ("double-octahedral 4", {}),
+    "hexapod": ("hexapod 5, no curve", {}),
+    "hexapod, elastic": ("loop hexapod 4, vertex goals", {"method.tracking_mode": "elastic"}),
+    "longeron": ("longeron_past_a_cube", {"method.tracking_mode": "elastic"}),
+    "longeron, hard tip": ("longeron 5, hard tip", {}),
+    "tetrahedral": ("tetrahedral 4, hard tracking", {}),
+    "pointing": ("octahedral 6, pointing", {}),
+    "two cubes": ("five_bay_two_cubes_pointing", {}),
+    "two cubes, elastic": ("five_bay_two_cubes_pointing", {"method.tracking_mode": "elastic"}),
+    "serial": ("snake_past_a_cube", {}),
+    "serial, pressed": ("twelve_joints_past_a_crate", {}),
+}
+"""Problems by name, and their changes."""
+
+
+def far_goals(resolver: vq.Resolver, rng: np.random.Generator, count: int) -> Iterator[dict[str, object]]:
+    """Goals so far from the tip that the answers of their first QPs often have to be corrected."""
+    unit = resolver.setup.arm.unit
+    for _ in range(count):
+        position, rotation = resolver.tip()
+        goal: dict[str, object] = {"position": position + rng.choice([0.2, 0.5]) * unit * rng.normal(size=3)}
+        if resolver.setup.task.turns == "pointing":
+            goal["pointing"] = rotation[:, 2] + 0.2 * rng.normal(size=3)
+        yield goal
+
+
+@pytest.mark.parametrize("name", FURTHER)
+def test_further_qps_are_those_of_an_attempt(name, driven, monkeypatch, rng):
+    problem = problem_of_two_qps(FURTHER[name][0], **FURTHER[name][1])
+    one, other = vq.Resolver(problem), vq.Resolver(problem)
+    found, apart = [], []
+    for goal in far_goals(one, rng, 25):
+        other.state = one.state
+        with monkeypatch.context() as patch:
+            # The first QP is the same; then an attempt goes on.
+            patch.setattr(Driver, "corrected", lambda self, state, target, begun, code: begun)
+            expected = other.step(**goal)
+        step = one.step(**goal)
+        assert (step.status, step.qps, step.reason) == (expected.status, expected.qps, expected.reason)
+        # Settling that ends one iteration sooner or later by rounding moves a state by some 1e-11 m, which may grow.
+        assert_same(step, expected, 1e3 * SAME)
+        apart.append(np.abs(step.state.q - expected.state.q).max())
+        if step.solution is not None:
+            assert step.solution.iterations == expected.solution.iterations
+            np.testing.assert_array_equal(step.rows.nodes, expected.rows.nodes)
+        found.append(step.qps)
+    assert max(found) > 1
+    assert np.mean(np.array(apart) < SAME) > 0.8
+
+
 def test_most_steps_are_usual(driven):
     maneuver = vq.solve(vq.load_problem("five_bay_two_cubes"))
     assert maneuver.certificate.ok
     assert len(driven) >= 20
     assert np.mean(driven) > 0.9
+
+
+def test_most_steps_of_further_qps_are_taken_by_calls(monkeypatch):
+    assert building().finish() is not None
+    found, take = [], Driver.take
+
+    def kept(self, *asked):
+        found.append(take(self, *asked))
+        return found[-1]
+
+    monkeypatch.setattr(Driver, "take", kept)
+    vq.solve(vq.load_problem("five_bay_two_cubes_pointing"))
+    further = [
+        one for one in found if isinstance(one, Begun | Lost) or (isinstance(one, Passage) and one.qps > 1)
+    ]
+    assert sum(isinstance(one, Passage) and one.qps == 2 for one in further) >= 10
+    assert np.mean([isinstance(one, Begun) for one in further]) < 0.1
 
 
 def lying(make, change):

@@ -51,7 +51,8 @@ class Code(IntEnum):
         ASKS,
         FLAWED,
         OFF_CURVE,
-    ) = range(14)
+        TOO_NEAR,
+    ) = range(15)
 
 
 class CompiledKernel(ctypes.Structure):

@@ -10,7 +10,7 @@ typedef long long Index;
 /* What functions return; see Code in __init__.py. */
 enum {
     DONE, NO_VALUE, INFEASIBLE, INACCURATE, UNSETTLED, FAILED, TOO_FAR, NOT_PROVEN, ELSEWHERE, CROWDED, OVERLAPPING,
-    ASKS, FLAWED, OFF_CURVE
+    ASKS, FLAWED, OFF_CURVE, TOO_NEAR
 };
 
 /* A function that CasADi generates, with its arguments, results and workspaces. */

@@ -2,7 +2,7 @@
 
    It is for arms whose bodies are spanned by their nodes, among pairs that a Way holds. The caller fills in goal and
    boxes among the arguments of the QP's function. Anything unusual ends the step with a code and leaves the state as it
-   was; the caller then takes the step by other means. */
+   was; the caller then asks for a further QP, or takes the step by other means. */
 
 #include <time.h>
 
@@ -61,6 +61,10 @@ typedef struct {
     double *contacts, *questions, *answers;
     int *group, *pair, *asked;
 
+    /* Whether the QP corrects what one before it left, and whether the last answer was settled; the nodes (N, 3) where the
+       QP is linearised. */
+    int corrects, settled;
+    const double *at;
     double reach, limit, self_limit, gap;
     double *spent;                         /* (3) s in each phase so far: distance, QP, acceptance */
 } StepData;
@@ -84,7 +88,8 @@ static void spend(double *phase, double *mark)
     *mark = time;
 }
 
-/* The row of contact k, see rows/clearance.py, limited so that a zero step is allowed and pairs slow down. */
+/* The row of contact k, see rows/clearance.py; of a QP that moves the arm, limited so that a zero step is allowed and
+   pairs slow down. */
 static void clearance_row(StepData *s, int k)
 {
     Fused *f = s->fused;
@@ -94,9 +99,14 @@ static void clearance_row(StepData *s, int k)
         f->near_nodes[4 * k + i] = p->points[4 * s->pair[k] + i];
         for (int a = 0; a < 3; a++) f->near_rows[12 * k + 3 * i + a] = contact[1 + i] * normal[a];
     }
-    double lower = (p->is_self ? s->self_safe : s->safe) + s->margin - contact[0];
-    lower = fmin(lower, 2.0 * s->margin);
-    f->near_lower[k] = fmax(lower, fmin(s->share_of_way * lower, -s->least_way));
+    double lower = (p->is_self ? s->self_safe : s->safe) + s->margin - contact[0], limited = fmin(lower, 2.0 * s->margin);
+    f->near_lower[k] = s->corrects ? lower : fmax(limited, fmin(s->share_of_way * limited, -s->least_way));
+}
+
+/* Whether the nodes of the way are at `place`. */
+static int is_at(const StepData *s, const double *place)
+{
+    return !memcmp(s->way->place, place, sizeof(double) * s->width);
 }
 
 /* The rows of all contacts nearer than the limits. */
@@ -108,7 +118,7 @@ static int list_rows(StepData *s)
     s->fused->near = s->round = s->asked_for = s->proven = 0;
     if (!w) return DONE;
     if (!(s->limit <= w->reach && s->self_limit <= w->self_reach)
-        || memcmp(w->place, s->nodes, sizeof(double) * s->width))
+        || !is_at(s, s->at))
         return ELSEWHERE;
     for (int g = 0; g < w->groups; g++) {
         const Pairs *p = w->group[g];
@@ -140,9 +150,18 @@ static void load(StepData *s)
     memcpy(arg[3], s->vertices, sizeof(double) * 3 * f->vertices);
     arg[6][0] = 1.0;
     arg[7][0] = 0.0;
+    s->corrects = 0;
+    s->at = s->nodes;
 }
 
-/* Set the distances below which pairs can become active in the step. */
+/* Set the distances below which pairs can become active where nodes move by the reach. */
+static void set_limits(StepData *s)
+{
+    s->limit = fmin(s->influence, s->safe + s->reach);
+    s->self_limit = fmin(s->influence, s->self_safe + 2.0 * s->reach);
+}
+
+/* The reach of the step, and the limits. */
 static void look_ahead(StepData *s)
 {
     Fused *f = s->fused;
@@ -154,8 +173,7 @@ static void look_ahead(StepData *s)
     for (int a = 0; a < 3; a++) asked = fmax(asked, fabs(f->velocity[a]));
     s->reach = s->influence;
     if (s->share >= 1.0) s->reach = s->motion_margin * (last == 0.0 ? s->influence : fmax(last, asked));
-    s->limit = fmin(s->influence, s->safe + s->reach);
-    s->self_limit = fmin(s->influence, s->self_safe + 2.0 * s->reach);
+    set_limits(s);
 }
 
 /* Ask for the contacts of all rows, or of those that press: whose multipliers are not zero. Those that were asked for
@@ -170,11 +188,11 @@ static int ask_for(StepData *s, int all)
         if (s->asked[k] || !(all || fabs(multiplier[k]) > 0.0)) continue;
         const Pairs *p = s->way->group[s->group[k]];
         double ends[6];
-        ends_for(p, s->pair[k], s->nodes, s->contacts + CONTACT * k, ends);
+        ends_for(p, s->pair[k], s->at, s->contacts + CONTACT * k, ends);
         axis_of(ends, s->scale, s->questions + 12 * k);
         if (p->is_self) {
             for (int i = 0; i < 2; i++)
-                memcpy(ends + 3 * i, s->nodes + 3 * p->points[4 * s->pair[k] + 2 + i], 3 * sizeof(double));
+                memcpy(ends + 3 * i, s->at + 3 * p->points[4 * s->pair[k] + 2 + i], 3 * sizeof(double));
             axis_of(ends, s->scale, s->questions + 12 * k + 6);
         }
         s->asked[k] = s->round;
@@ -191,7 +209,7 @@ static void use_answers(StepData *s)
         double answer[7];
         for (int i = 0; i < 7; i++) answer[i] = s->answers[7 * k + i] / s->scale;
         Pairs *p = s->way->group[s->group[k]];
-        if (!prove(p, s->pair[k], s->nodes, answer, s->flaw, s->apart, s->contacts + CONTACT * k)) continue;
+        if (!prove(p, s->pair[k], s->at, answer, s->flaw, s->apart, s->contacts + CONTACT * k)) continue;
         s->proven++;
         clearance_row(s, k);
     }
@@ -219,18 +237,26 @@ static void rotation_by(const double *vector, double *R)
     }
 }
 
+/* The goal's rotation (3, 3), column by column, where the answer led. */
+static void turned_goal(const StepData *s, double *goal)
+{
+    const Fused *f = s->fused;
+    double spin[3], turning[9];
+    for (int a = 0; a < 3; a++) spin[a] = *f->gone * f->spin[a];
+    rotation_by(spin, turning);
+    product(turning, f->condense.arg[9], goal);
+}
+
 /* The angle, rad, from the tip's z-axis or orientation, as its nodes have it, to the goal's. */
 static double turn_missing(StepData *s)
 {
     const Fused *f = s->fused;
-    double spin[3], turning[9], goal[9], w[3] = {0.0, 0.0, 0.0}, cosine = 0.0;
+    double goal[9], w[3] = {0.0, 0.0, 0.0}, cosine = 0.0;
     for (int k = 0; k < f->tip_nodes; k++)
         memcpy((double *)s->frame.arg[0] + 3 * k, s->next_nodes + 3 * f->tip_node[k], sizeof(double) * 3);
     if (call(&s->frame)) return NAN;
     const double *tip = s->frame.res[0];
-    for (int a = 0; a < 3; a++) spin[a] = *f->gone * f->spin[a];
-    rotation_by(spin, turning);
-    product(turning, f->condense.arg[9], goal);
+    turned_goal(s, goal);
     if (s->turns == 2) {
         cross(tip + 6, goal + 6, w);
         cosine = dot(tip + 6, goal + 6, 3);
@@ -346,22 +372,27 @@ static int is_clear(const StepData *s)
     return 1;
 }
 
+/* Lead the way straight to `place`, where the pairs that are wanted are evaluated. */
+static int lead_to(StepData *s, const double *place)
+{
+    Way *w = s->way;
+    memcpy(s->places, w->place, sizeof(double) * s->width);
+    memcpy(s->places + s->width, place, sizeof(double) * s->width);
+    w->pieces = 1;
+    w->places = s->places;
+    w->floor = w->self_floor = -INFINITY;
+    return advance_pairs(w);
+}
+
 /* Prove the way to the next state in a number of pieces on which q moves straight, each with `spare` added to its floors. */
 static int pass(StepData *s, int pieces, double spare)
 {
     const Fused *f = s->fused;
     Way *w = s->way;
     int size = s->width;
-    if (memcmp(w->place, s->nodes, sizeof(double) * size)) {
-        /* A try before this one led away. */
-        memcpy(s->places, w->place, sizeof(double) * size);
-        memcpy(s->places + size, s->nodes, sizeof(double) * size);
-        w->pieces = 1;
-        w->places = s->places;
-        w->floor = w->self_floor = -INFINITY;
-        int code = advance_pairs(w);
-        if (code) return code;
-    }
+    /* A try before this one may have led away. */
+    int code = is_at(s, s->nodes) ? DONE : lead_to(s, s->nodes);
+    if (code) return code;
     memcpy(s->places, s->nodes, sizeof(double) * size);
     for (int k = 1; k < pieces; k++) {
         double share = (double)k / pieces, *q = (double *)s->place.arg[0];
@@ -377,10 +408,21 @@ static int pass(StepData *s, int pieces, double spare)
     return advance_pairs(w);
 }
 
+/* Whether the next state, the way to which is proven or not, as `code` says, keeps all clearances itself. */
+static int judge(StepData *s, int code)
+{
+    if (code == NOT_PROVEN && !is_at(s, s->next_nodes) && lead_to(s, s->next_nodes)) return NOT_PROVEN;
+    if (code && code != NOT_PROVEN) return code;
+    return is_clear(s) ? code : TOO_NEAR;
+}
+
 /* Prove the way to the next state; see Separation.between. */
 static int prove_way(StepData *s)
 {
-    if (!s->bend.eval) return s->way ? pass(s, 1, -s->rounding) : DONE;
+    if (!s->bend.eval) {
+        int code = s->way ? pass(s, 1, -s->rounding) : DONE;
+        return code ? judge(s, code) : DONE;
+    }
     double **arg = (double **)s->bend.arg;
     memcpy(arg[0], s->q, sizeof(double) * s->fused->coordinates);
     memcpy(arg[1], s->next_q, sizeof(double) * s->fused->coordinates);
@@ -392,24 +434,39 @@ static int prove_way(StepData *s)
     double needed = deviation >= s->unit ? 1.0 : fmin(ceil(sqrt(fmax(deviation / s->between, 1.0))), MOST_PIECES);
     int pieces = (int)needed, code = pass(s, 1, deviation - s->between);
     if (code == NOT_PROVEN && pieces > 1) code = pass(s, pieces, deviation / (needed * needed) - s->between);
-    return code || is_clear(s) ? code : NOT_PROVEN;
+    return judge(s, code);
+}
+
+/* Whether the answer led too far, or to no place at all: q, and the curve's vertices `points`. */
+static int leaps(const StepData *s, const double *q, const double *points)
+{
+    const Fused *f = s->fused;
+    double furthest = 0.0;
+    if (!(f->furthest < s->furthest)) return 1;
+    for (int k = 0; k < 3 * f->vertices; k++) furthest = fmax(furthest, fabs(points[k] - s->vertices[k]));
+    return !(furthest < s->leap && norm(q, f->coordinates) + norm(points, 3 * f->vertices) < INFINITY);
+}
+
+/* Write the nodes at q to those of the next state. */
+static int put_nodes(StepData *s, const double *q)
+{
+    const double *nodes = q;
+    if (s->place.eval) {
+        memcpy((double *)s->place.arg[0], q, sizeof(double) * s->fused->coordinates);
+        if (call(&s->place)) return NO_VALUE;
+        nodes = s->place.res[0];
+    }
+    memcpy(s->next_nodes, nodes, sizeof(double) * s->width);
+    return DONE;
 }
 
 /* Check where the answer led, and prove the way there. */
 static int arrive(StepData *s)
 {
     Fused *f = s->fused;
-    double furthest = 0.0;
-    if (!(f->furthest < s->furthest)) return FLAWED;
-    for (int k = 0; k < 3 * f->vertices; k++) furthest = fmax(furthest, fabs(f->points[k] - s->vertices[k]));
-    if (!(furthest < s->leap && norm(f->q, f->coordinates) + norm(f->points, 3 * f->vertices) < INFINITY)) return FLAWED;
+    if (leaps(s, f->q, f->points)) return FLAWED;
     memcpy(s->next_q, f->q, sizeof(double) * f->coordinates);
-    memcpy(s->next_nodes, f->q, s->place.eval ? 0 : sizeof(double) * s->width);
-    if (s->place.eval) {
-        memcpy((double *)s->place.arg[0], f->q, sizeof(double) * f->coordinates);
-        if (call(&s->place)) return NO_VALUE;
-        memcpy(s->next_nodes, s->place.res[0], sizeof(double) * s->width);
-    }
+    if (put_nodes(s, f->q)) return NO_VALUE;
     memcpy(s->next_values, f->close.res[1], sizeof(double) * s->quantities);
     if (!is_flawless(s)) return FLAWED;
     end_curve(s);
@@ -427,9 +484,14 @@ static int arrive(StepData *s)
 /* Answer the QP; go there, unless rows press whose contacts are to be asked for first. */
 static int proceed(StepData *s, double *mark)
 {
-    int code = answer(s->fused);
-    if (!code && s->asks && !s->fused->other && ask_for(s, 0)) code = ASKS;
-    else if (!code) code = depart(s->fused, s->tolerance);
+    Fused *f = s->fused;
+    int code = answer(f);
+    if (!code && s->asks && !f->other && ask_for(s, 0)) code = ASKS;
+    else if (!code) {
+        code = depart(f, s->tolerance);
+        s->settled = !code;
+        if (code == UNSETTLED && leaps(s, f->started, f->started_points)) code = FLAWED;
+    }
     spend(&s->spent[QP], mark);
     if (code) return code;
     code = arrive(s);
@@ -437,24 +499,30 @@ static int proceed(StepData *s, double *mark)
     return code;
 }
 
-/* Take the step from the state. */
-EXPORT int take(StepData *s)
+/* List the rows of the QP that was loaded, assemble it, and go where its answer leads. */
+static int solve_step(StepData *s, double *mark)
 {
-    double mark = now();
-    look_ahead(s);
     int code = list_rows(s);
-    spend(&s->spent[DISTANCE], &mark);
+    spend(&s->spent[DISTANCE], mark);
     if (code) return code;
     if (s->way) {
         s->way->wanted = s->ahead * s->limit;
         s->way->self_wanted = s->ahead * s->self_limit;
     }
-    load(s);
     code = assemble(s->fused);
     /* A solver that only comes near zero does not say which rows press, and is too slow to be asked twice. */
     if (!code && s->asks && s->fused->other && ask_for(s, 1)) code = ASKS;
-    spend(&s->spent[QP], &mark);
-    return code ? code : proceed(s, &mark);
+    spend(&s->spent[QP], mark);
+    return code ? code : proceed(s, mark);
+}
+
+/* Take the step from the state. */
+EXPORT int take(StepData *s)
+{
+    double mark = now();
+    look_ahead(s);
+    load(s);
+    return solve_step(s, &mark);
 }
 
 /* Go on with a step that asked for contacts. */
@@ -464,4 +532,40 @@ EXPORT int resume(StepData *s)
     use_answers(s);
     spend(&s->spent[DISTANCE], &mark);
     return proceed(s, &mark);
+}
+
+/* Take the step by a further QP, linearised where the last one led, which returns to the constraints by the least
+   displacement: after an answer that was not settled, a state too near to something, or stations off the curve. It may be
+   called again where there was no room for its rows. */
+EXPORT int correct(StepData *s)
+{
+    Fused *f = s->fused;
+    Way *w = s->way;
+    double mark = now(), **arg = (double **)f->condense.arg;
+    const double *q = s->settled ? f->q : f->started;
+    if (!s->settled && put_nodes(s, q)) return NO_VALUE;
+    memcpy(arg[0], q, sizeof(double) * f->coordinates);
+    memcpy(arg[1], q, sizeof(double) * f->coordinates);
+    memcpy(arg[2], s->next_nodes, sizeof(double) * s->width);
+    memcpy(arg[3], s->settled ? f->points : f->started_points, sizeof(double) * 3 * f->vertices);
+    for (int a = 0; a < 3; a++) arg[8][a] += *f->gone * f->velocity[a];
+    if (s->turns) {
+        double goal[9];
+        turned_goal(s, goal);
+        memcpy(arg[9], goal, sizeof(goal));
+    }
+    *f->gone = arg[6][0] = 0.0;
+    arg[7][0] = f->reached;
+    s->corrects = 1;
+    s->at = s->next_nodes;
+    /* A pair that one correction pushed apart must stay listed for the next, or two corrections alternate. */
+    s->reach = fmax(s->reach, f->furthest);
+    set_limits(s);
+    if (w && !(s->limit <= w->reach && s->self_limit <= w->self_reach && is_at(s, s->at))) {
+        w->wanted = s->limit;
+        w->self_wanted = s->self_limit;
+        int code = lead_to(s, s->at);
+        if (code) return code;
+    }
+    return solve_step(s, &mark);
 }

@@ -21,14 +21,17 @@ from vgtm_qp.step.acceptance import Acceptance
 from vgtm_qp.step.actuation import Actuation
 from vgtm_qp.step.driver import (
     DEVIATION,
+    FREE_QPS,
     LEAP,
+    MOST_QPS,
     MOTION_MARGIN,
     PHASES,
     SINGULAR,
     Begun,
     Driver,
-    Passage,
+    Lost,
     can_drive,
+    is_cut_short,
 )
 from vgtm_qp.step.engine import Engine, FusedEngine
 from vgtm_qp.step.separation import RECOVERY, Separation
@@ -37,20 +40,13 @@ from vgtm_qp.step.state import Shortfall, State
 from vgtm_qp.step.step import WHOLE, Step, StepStatus
 from vgtm_qp.step.target import QPInput, Target, base_frame
 
-_FREE_QPS = 3
-"""Greatest number of QPs with free progress along the piece of path."""
-
-_MOST_QPS = 6
-"""Greatest number of QPs: the last ones start anew from the first answer, and go no further than it."""
-
 _MOST_FRACTIONS = 8
 """Greatest number of times between two states for which a QP has rows."""
 
+_NO_CONVERGENCE = "no convergence"
+
 _SETTLING = 5e-3
 """Tip error after a QP, over the arm's length, above which another QP is solved."""
-
-_NOTHING = 1e-9
-"""Progress of a QP below which its corrections may go further than the QP."""
 
 FURTHER = 1.25
 """Least progress off the curve, over that on the curve, for which stations leave it."""
@@ -137,7 +133,7 @@ class Attempt:
             return None
         driven = self._driven(state, target, 1.0, engine)
         self._tried = state, target, driven
-        return driven if isinstance(driven, Step) else None
+        return driven if isinstance(driven, Step) and driven.moved else None
 
     def run(
         self,
@@ -204,12 +200,15 @@ class Attempt:
             driver = self._drivers[engine] = Driver(self._setup, engine, self.accuracy, self.separation)
             self.phases.join(PHASES, driver.spent)
         taken = driver.take(state, target, share)
-        if not isinstance(taken, Passage):
+        if taken is None or isinstance(taken, Begun):
             self.phases.start()
             return taken
-        self.qps += 1
-        of_qp = {"qps": 1, "solution": taken.solution, "rows": taken.rows}
-        return self._accepted(taken.state, taken.progress, taken.gap, **of_qp)
+        qps = MOST_QPS if isinstance(taken, Lost) else taken.qps
+        self.qps += qps
+        of_qps: dict[str, Any] = {"qps": qps, "solution": taken.solution, "rows": taken.rows}
+        if isinstance(taken, Lost):
+            return Step(StepStatus.BLOCKED, 0.0, state, _NO_CONVERGENCE, **of_qps)
+        return self._accepted(taken.state, taken.progress, taken.gap, **of_qps)
 
     def _recovery(self, short: Shortfall) -> float:
         """Return the distance by which pairs that are too near are driven apart, m."""
@@ -258,20 +257,19 @@ class Attempt:
         gain: float,
         engine: Engine,
     ) -> Step:
-        """Run the attempt from its first input or after its first QP; `short` pairs are driven apart by `gain`, m."""
+        """Run the attempt from its first input or its beginning; `short` pairs are driven apart by `gain`, m."""
         phases, separation = self.phases, self.separation
         q, fractions = state.q, list[float]()
-        rows: ClearanceRows | None = None
-        first: Move | None = None
+        first, rows, covered, target, begun = _beginning(begin, target)
         move: Move | None = None
-        covered = 1.0
+        self.qps += begun - 1
 
         def blocked(reason: str, failure: FailedStepError | None = None, solver_failed: bool = False) -> Step:
             kept = Step(StepStatus.BLOCKED, 0.0, state, reason, count, solver_failed)
             return replace(kept, solution=first and first.solution, rows=rows, failure=failure)
 
-        for count in range(1, _MOST_QPS + 1):
-            if count > _FREE_QPS and covered == 1.0 and first is not None and self._is_cut_short(first):
+        for count in range(begun, MOST_QPS + 1):
+            if count > FREE_QPS and covered == 1.0 and first is not None and is_cut_short(self._setup, first):
                 # Corrections towards the end of the piece would leave what the first QP allowed, and not
                 # converge.
                 covered = first.progress
@@ -327,15 +325,11 @@ class Attempt:
             fractions.extend(s for s in report.failing_parameters() if s not in fractions)
             if len(fractions) > _MOST_FRACTIONS:
                 return blocked("clearance between the states")
-        return blocked("no convergence")
+        return blocked(_NO_CONVERGENCE)
 
     def _furthest(self, q: Array, target: Target) -> Array | None:
         """Return ``Arm.furthest`` within the boxes of a target; None if the base moves."""
         return None if target.base is not None else self._arm.furthest(q, target.lower, target.upper)
-
-    def _is_cut_short(self, move: Move) -> bool:
-        """Return whether the answer of a first QP covers a part of the piece, and not the whole of it."""
-        return self._setup.tip_mode == "scaled" and _NOTHING < move.progress < WHOLE
 
     def _leap(self, state: State, move: Move) -> str:
         """Return why the QP's answer leads too far from `state` for its rows; empty if it does not."""
@@ -377,6 +371,19 @@ class Attempt:
         if last == 0.0 or target.base is not None:
             return self._influence
         return max(last, abs(target.end - target.start) * float(np.abs(goal.velocity).max()))
+
+
+def _beginning(
+    begin: QPInput | Begun, target: Target
+) -> tuple[Move | None, ClearanceRows | None, float, Target, int]:
+    """Return the first answer and its rows; then the share of the piece that the next QP is for, its target and number.
+
+    The next one of a beginning is that whose answer is there already.
+    """
+    if not isinstance(begin, Begun):
+        return None, None, 1.0, target, 1
+    covered = begin.covered
+    return begin.first, begin.rows, covered, target if covered == 1.0 else target.part(covered), begin.qps
 
 
 def _reason(error: SolverError) -> tuple[str, FailedStepError | None, bool]:

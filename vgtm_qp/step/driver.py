@@ -2,11 +2,12 @@
 
 It takes the same step as an attempt of :mod:`vgtm_qp.step.attempt`, in a third of the time. What is unusual it leaves
 to that: pairs that are too near already, obstacles that move, meshes and hulls, angles, a moving base, a path that
-bends within the step, a second QP. See ``native/step.c``.
+bends within the step, rows at places between two states. Each further QP is one more call. See ``native/step.c``.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import pairwise
 from time import perf_counter
 from typing import NamedTuple
@@ -29,6 +30,7 @@ from vgtm_qp.step.engine import FusedEngine
 from vgtm_qp.step.separation import MOST_PIECES, Separation
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import State
+from vgtm_qp.step.step import WHOLE
 from vgtm_qp.step.target import Target
 
 MOTION_MARGIN = 2.5
@@ -43,6 +45,18 @@ LEAP = 1.0
 DEVIATION = 0.1
 """Greatest deviation of points from their chords in one step, over the arm's length."""
 
+FREE_QPS = 3
+"""Greatest number of QPs with free progress along the piece of path."""
+
+MOST_QPS = 6
+"""Greatest number of QPs: the last ones start anew from the first answer, and go no further than it."""
+
+_NOTHING = 1e-9
+"""Progress of a QP below which its corrections may go further than the QP."""
+
+_AGAIN = Code.UNSETTLED, Code.TOO_NEAR, Code.OFF_CURVE
+"""How a QP ends that another one may correct."""
+
 PHASES = "distance", "qp", "acceptance"
 """Parts of a step whose times are known."""
 
@@ -53,21 +67,46 @@ _ROOM = 64
 
 
 class Passage(NamedTuple):
-    """A step that was taken: its state, progress and gap, and the QP's answer and rows; see ``Step``."""
+    """A step that was taken: state, progress and gap, answer and rows of its first QP, number of QPs; see ``Step``."""
 
     state: State
     progress: float
     gap: float
     solution: StepSolution
     rows: ClearanceRows
+    qps: int = 1
 
 
 class Begun(NamedTuple):
-    """A step that needs further QPs: where the first one led, its rows, and the reach of pairs, m, in it."""
+    """A step that needs other proofs, or QPs with other rows: where the last QP led, and how it came to that.
+
+    Attributes
+    ----------
+    move, first : Move
+        Where the last QP led, and the first one.
+    rows : ClearanceRows
+        Of the first QP.
+    reach : float
+        That of pairs in the last QP, m.
+    qps : int
+        Number of QPs so far.
+    covered : float
+        Share of the piece of path that the last QP was for.
+    """
 
     move: Move
+    first: Move
     rows: ClearanceRows
     reach: float
+    qps: int = 1
+    covered: float = 1.0
+
+
+class Lost(NamedTuple):
+    """A step whose QPs, all that there may be, did not converge; the answer and the rows of the first one."""
+
+    solution: StepSolution
+    rows: ClearanceRows
 
 
 def can_drive(setup: Setup) -> bool:
@@ -76,6 +115,11 @@ def can_drive(setup: Setup) -> bool:
     is_plain = layout.general is None and layout.own is None and setup.base_motion is None
     without_limits = setup.minimum_angle == 0.0 and setup.step_limit == np.inf
     return is_plain and without_limits
+
+
+def is_cut_short(setup: Setup, move: Move) -> bool:
+    """Return whether the answer of a first QP covers a part of the piece, and not the whole of it."""
+    return setup.tip_mode == "scaled" and _NOTHING < move.progress < WHOLE
 
 
 class Driver:
@@ -96,7 +140,7 @@ class Driver:
         self.spent = np.zeros(len(PHASES))
         self._started = self._is_placed = False
 
-    def take(self, state: State, target: Target, share: float) -> Passage | Begun | None:
+    def take(self, state: State, target: Target, share: float) -> Passage | Begun | Lost | None:
         """Return the step from `state`, in which no pair is too near, to the end of the target's piece of path.
 
         The motion of the step before, times `share`, predicts this one. None if nothing is known of the step.
@@ -124,27 +168,63 @@ class Driver:
         else:
             data.way = watch.started(state.nodes).address
             watch.refresh()
-        code, has_moved = self._take(), False
-        while code > Code.DONE:
+        code = self._called(self._take)
+        if code == Code.ELSEWHERE:
+            assert watch is not None
+            data.way = watch.move_to(state.nodes, data.limit, data.self_limit).address
+            code = self._called(self._take)
+        if code == Code.DONE:
+            return self._passage(state, target)
+        if code in _AGAIN or code == Code.NOT_PROVEN:
+            first = self._solver.led(state.torsion, is_settled=bool(data.settled))
+            return self.corrected(state, target, Begun(first, first, self._rows(), data.reach), code)
+        return None
+
+    def _called(self, call: Callable[[], int]) -> int:
+        """Return how a QP ended that a `call` solves, where what it asks for is answered, and there is enough room."""
+        code, data = call(), self._program.data
+        while code == Code.ASKS or code == Code.CROWDED:
             if code == Code.ASKS:
                 self._ask()
                 code = self._resume()
-            elif code == Code.CROWDED:
-                self._make_room(2 * data.room)
-                code = self._take()
-            elif code == Code.ELSEWHERE and not has_moved:
-                assert watch is not None
-                data.way, has_moved = watch.move_to(state.nodes, data.limit, data.self_limit).address, True
-                code = self._take()
-            elif code in (Code.UNSETTLED, Code.NOT_PROVEN):
-                move = self._solver.led(state.torsion, is_settled=code == Code.NOT_PROVEN)
-                return Begun(move, self._rows(), data.reach)
             else:
-                return None
-        if data.asked_for:
-            assert monitor.scene.fcl is not None
-            monitor.scene.fcl.refused += data.asked_for - data.proven
-        return self._passage(state, target)
+                self._make_room(2 * data.room)
+                code = call()
+        if data.asked_for and (code == Code.DONE or code in _AGAIN):
+            fcl = self._setup.monitor.scene.fcl
+            assert fcl is not None
+            fcl.refused += data.asked_for - data.proven
+        return code
+
+    def corrected(self, state: State, target: Target, begun: Begun, code: int) -> Passage | Begun | Lost:
+        """Return the step by further QPs after the first one, which ended with `code`; its beginning if unusual."""
+        data, first, covered = self._program.data, begun.first, 1.0
+        for qps in range(2, MOST_QPS + 1):
+            if code not in _AGAIN:
+                return begun
+            if qps > FREE_QPS and covered == 1.0 and is_cut_short(self._setup, first):
+                covered = first.progress
+                self._cut(target.part(covered), first)
+            self._solver.draw(state.control_vertices, None)
+            code = self._called(self._correct)
+            found = self._passage(state, target) if code == Code.DONE else None
+            if found is not None:
+                progress = covered * found.progress
+                return Passage(found.state, progress, found.gap, first.solution, begun.rows, qps)
+            if code == Code.NOT_PROVEN:
+                move = self._solver.led(state.torsion, is_settled=True)
+                return begun._replace(move=move, reach=data.reach, qps=qps, covered=covered)
+        return Lost(first.solution, begun.rows) if code in _AGAIN else begun
+
+    def _cut(self, target: Target, first: Move) -> None:
+        """Go back to where the `first` answer led, at the end of the `target`."""
+        work, inputs = self._work, self._work.condense.inputs
+        goal = target.goal(1.0).over(target.end - target.start)
+        work.started[:], work.started_points[:] = first.q.reshape(-1), first.vertices.reshape(-1)
+        inputs[8][:], inputs[10][:] = goal.position, goal.velocity
+        if self._setup.task.turns is not None:
+            inputs[9].reshape(3, 3)[:], inputs[11][:] = goal.rotation.T, goal.spin
+        work.gone[0], work.data.reached, self._program.data.settled = 0.0, 1.0, 0
 
     def _load(self, state: State, target: Target, share: float) -> None:
         """Write the step's state, goal and boxes."""
@@ -290,7 +370,7 @@ class Driver:
             program.set(levers=known.levers)
         if setup.task.turns is not None:
             program.set(frame=tip_function(arm).kernel())
-        self._take, self._resume = program.entry("take"), program.entry("resume")
+        self._take, self._resume, self._correct = map(program.entry, ("take", "resume", "correct"))
         program.set(
             fused=work.address,
             width=arm.home.size,
