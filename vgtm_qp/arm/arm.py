@@ -114,6 +114,24 @@ class Tip:
         return np.asarray(self.weights @ X.take(self.nodes, axis=0))
 
 
+class Ends(NamedTuple):
+    """Points of bodies that are functions of several nodes each, for C.
+
+    Attributes
+    ----------
+    place : Kernel
+        A function of its own, q -> all points (3, P).
+    row : Kernel
+        A function of its own, (nodes (3, 3), offset (3)) of a point -> the point, its derivatives (3, 9) by the nodes.
+    nodes, offset : (P, 3) int, (P, 3)
+    """
+
+    place: Kernel
+    row: Kernel
+    nodes: Index
+    offset: Array
+
+
 class Arithmetic(NamedTuple):
     """An arm in arrays and functions for C, where one call takes the whole step.
 
@@ -125,7 +143,7 @@ class Arithmetic(NamedTuple):
         A function of its own, (q, q) -> bounds (2 or more); the greater of the first two is four times
         ``Arm.deviation``. None where nodes move straight when q does.
     distances : bool
-        Whether quantity m is the distance of the nodes ``first[m]`` and ``last[m]``. If it is not, it is the coordinate
+        Whether quantity m is the distance of the points ``first[m]`` and ``last[m]``. If it is not, it is coordinate
         ``first[m]`` of q less ``multiplier[m]`` times the coordinate ``last[m]``.
     first, last, multiplier : (M,)
     levers : array or None
@@ -133,6 +151,8 @@ class Arithmetic(NamedTuple):
         the greatest displacement.
     based : int array
         Coordinates of q that only the base moves.
+    ends : Ends or None
+        The points of the bodies; None where these are the nodes.
     """
 
     place: Kernel | None
@@ -143,6 +163,7 @@ class Arithmetic(NamedTuple):
     multiplier: Array
     levers: Array | None
     based: Index
+    ends: Ends | None = None
 
 
 class Description(Protocol):
@@ -372,7 +393,7 @@ class Arm(ABC):
         """Return (N, 3) the nodes at a configuration, m."""
 
     def arithmetic(self) -> Arithmetic | None:
-        """Return what C has to know of the arm; None where the bodies' points are not the nodes."""
+        """Return what C has to know of the arm; None where it cannot take its steps."""
         return None
 
     def points(self, q: Array) -> Array:

@@ -1,6 +1,6 @@
 /* A step of an arm in one call: near pairs, QP, settling, the checks of the new state and the proof of the way there.
 
-   It is for arms whose bodies are spanned by their nodes, among pairs that a Way holds. The caller fills in goal and
+   It is for arms whose bodies are capsules, among pairs that a Way holds. The caller fills in goal and
    boxes among the arguments of the QP's function. Anything unusual ends the step with a code and leaves the state as it
    was; the caller then asks for a further QP, or takes the step by other means. */
 
@@ -11,6 +11,11 @@ typedef struct {
     Way *way;                      /* null if no two bodies, and no body and piece, can ever be near */
     /* See arm.Arithmetic; without an eval the nodes are q, or move straight. (tip's nodes) -> its rotation. */
     Kernel place, bend, frame;
+    /* See arm.Ends; without an eval the points of the bodies are the nodes. */
+    Kernel spread, end;
+    int slots, span;                       /* nodes of a row of clearance; coordinates of all points */
+    const int *end_nodes;                  /* (P, 3) */
+    const double *offset;                  /* (P, 3) */
 
     /* Numbers of: coordinates of the nodes; quantities; coordinates of q that only the base moves, and these; the axes of
        the tip's position, and these. */
@@ -52,7 +57,8 @@ typedef struct {
     double *q, *nodes, *vertices, *values, *motion;
     double *next_q, *next_nodes, *next_vertices, *next_values, *next_motion, *next_rates, *next_tip;
     double duration;
-    double *places;                        /* (MOST_PIECES + 1, N, 3) */
+    double *points, *next_points;          /* (P, 3) those of the bodies; the nodes where they are the same */
+    double *places;                        /* (MOST_PIECES + 1, P, 3) */
 
     /* Rows of clearance: their contacts (R, 9), numbers of group and pair, and in which round they were asked for, 0 in
        none; middle and span of the body and of the other body (R, 12), and the answer (R, 7): a distance, a point of the
@@ -61,10 +67,10 @@ typedef struct {
     double *contacts, *questions, *answers;
     int *group, *pair, *asked;
 
-    /* Whether the QP corrects what one before it left, and whether the last answer was settled; the nodes (N, 3) where the
-       QP is linearised. */
+    /* Whether the QP corrects what one before it left, and whether the last answer was settled; the points (P, 3) and the
+       nodes (N, 3) where the QP is linearised. */
     int corrects, settled;
-    const double *at;
+    const double *at, *nodes_at;
     double reach, limit, self_limit, gap;
     double *spent;                         /* (3) s in each phase so far: distance, QP, acceptance */
 } StepData;
@@ -88,25 +94,47 @@ static void spend(double *phase, double *mark)
     *mark = time;
 }
 
+/* A row over the displacement of a point of a body, `part` (3), as one over its nodes (3) and their displacements (3, 3). */
+static int over_nodes(StepData *s, int point, const double *part, int *nodes, double *row)
+{
+    for (int k = 0; k < 3; k++) {
+        nodes[k] = s->end_nodes[3 * point + k];
+        memcpy((double *)s->end.arg[0] + 3 * k, s->nodes_at + 3 * nodes[k], 3 * sizeof(double));
+    }
+    memcpy((double *)s->end.arg[1], s->offset + 3 * point, 3 * sizeof(double));
+    if (call(&s->end)) return NO_VALUE;
+    for (int i = 0; i < 9; i++) row[i] = dot(part, s->end.res[1] + 3 * i, 3);
+    return DONE;
+}
+
 /* The row of contact k, see rows/clearance.py; of a QP that moves the arm, limited so that a zero step is allowed and
    pairs slow down. */
-static void clearance_row(StepData *s, int k)
+static int clearance_row(StepData *s, int k)
 {
     Fused *f = s->fused;
     const double *contact = s->contacts + CONTACT * k, *normal = contact + NORMAL;
     const Pairs *p = s->way->group[s->group[k]];
+    int *nodes = f->near_nodes + s->slots * k;
+    double *rows = f->near_rows + 3 * s->slots * k, part[3];
     for (int i = 0; i < 4; i++) {
-        f->near_nodes[4 * k + i] = p->points[4 * s->pair[k] + i];
-        for (int a = 0; a < 3; a++) f->near_rows[12 * k + 3 * i + a] = contact[1 + i] * normal[a];
+        int point = p->points[4 * s->pair[k] + i];
+        for (int a = 0; a < 3; a++) part[a] = contact[1 + i] * normal[a];
+        if (s->end.eval) {
+            if (over_nodes(s, point, part, nodes + 3 * i, rows + 9 * i)) return NO_VALUE;
+            continue;
+        }
+        nodes[i] = point;
+        memcpy(rows + 3 * i, part, sizeof(part));
     }
     double lower = (p->is_self ? s->self_safe : s->safe) + s->margin - contact[0], limited = fmin(lower, 2.0 * s->margin);
     f->near_lower[k] = s->corrects ? lower : fmax(limited, fmin(s->share_of_way * limited, -s->least_way));
+    return DONE;
 }
 
-/* Whether the nodes of the way are at `place`. */
+/* Whether the points of the way are at `place`. */
 static int is_at(const StepData *s, const double *place)
 {
-    return !memcmp(s->way->place, place, sizeof(double) * s->width);
+    return !memcmp(s->way->place, place, sizeof(double) * s->span);
 }
 
 /* The rows of all contacts nearer than the limits. */
@@ -114,7 +142,7 @@ static int list_rows(StepData *s)
 {
     Way *w = s->way;
     int count = 0;
-    s->fused->slots = 4;
+    s->fused->slots = s->slots;
     s->fused->near = s->round = s->asked_for = s->proven = 0;
     if (!w) return DONE;
     if (!(s->limit <= w->reach && s->self_limit <= w->self_reach)
@@ -132,15 +160,25 @@ static int list_rows(StepData *s)
             s->group[count] = g;
             s->pair[count] = (int)p->rows[i >> 1];
             s->asked[count] = 0;
-            clearance_row(s, count++);
+            if (clearance_row(s, count++)) return NO_VALUE;
         }
     }
     s->fused->near = count;
     return DONE;
 }
 
+/* The points of the bodies at q, where they are no copy of it: `points` (P, 3). */
+static int spread_at(StepData *s, const double *q, double *points)
+{
+    const Kernel *kernel = s->spread.eval ? &s->spread : &s->place;
+    memcpy((double *)kernel->arg[0], q, sizeof(double) * s->fused->coordinates);
+    if (call(kernel)) return NO_VALUE;
+    memcpy(points, kernel->res[0], sizeof(double) * s->span);
+    return DONE;
+}
+
 /* Write the point at which the QP is linearised: residuals at q, Jacobians in the middle of the expected motion. */
-static void load(StepData *s)
+static int load(StepData *s)
 {
     Fused *f = s->fused;
     double **arg = (double **)f->condense.arg;
@@ -151,7 +189,9 @@ static void load(StepData *s)
     arg[6][0] = 1.0;
     arg[7][0] = 0.0;
     s->corrects = 0;
-    s->at = s->nodes;
+    s->at = s->points;
+    s->nodes_at = s->nodes;
+    return s->spread.eval ? spread_at(s, s->q, s->points) : DONE;
 }
 
 /* Set the distances below which pairs can become active where nodes move by the reach. */
@@ -202,7 +242,7 @@ static int ask_for(StepData *s, int all)
 }
 
 /* Use the answers of this round that are proven. */
-static void use_answers(StepData *s)
+static int use_answers(StepData *s)
 {
     for (int k = 0; k < s->fused->near; k++) {
         if (s->asked[k] != s->round) continue;
@@ -211,8 +251,9 @@ static void use_answers(StepData *s)
         Pairs *p = s->way->group[s->group[k]];
         if (!prove(p, s->pair[k], s->at, answer, s->flaw, s->apart, s->contacts + CONTACT * k)) continue;
         s->proven++;
-        clearance_row(s, k);
+        if (clearance_row(s, k)) return NO_VALUE;
     }
+    return DONE;
 }
 
 /* C (3, 3) = A B, column by column. */
@@ -276,12 +317,12 @@ static double turn_missing(StepData *s)
 static int is_flawless(StepData *s)
 {
     Fused *f = s->fused;
-    const double *x = s->next_nodes, *lower = f->condense.arg[4], *upper = f->condense.arg[5];
+    const double *x = s->next_nodes, *ends = s->next_points, *lower = f->condense.arg[4], *upper = f->condense.arg[5];
     double rounding = s->relative * norm(f->q, f->coordinates), beyond = 0.0, wrong = 0.0, off = 0.0;
     for (int i = 0; i < s->based; i++)
         if (f->q[s->base[i]] != s->q[s->base[i]]) return 0;
     for (int m = 0, k = 0; m < s->quantities; m++) {
-        double value = s->distances ? sqrt(square_of(x + 3 * s->first[m], x + 3 * s->last[m]))
+        double value = s->distances ? sqrt(square_of(ends + 3 * s->first[m], ends + 3 * s->last[m]))
                                     : f->q[s->first[m]] - s->multiplier[m] * f->q[s->last[m]];
         int is_actuator = k < f->actuators && s->actuator[k] == m;
         double least = is_actuator ? lower[k] : s->home[m], greatest = is_actuator ? upper[k] : s->home[m];
@@ -376,8 +417,8 @@ static int is_clear(const StepData *s)
 static int lead_to(StepData *s, const double *place)
 {
     Way *w = s->way;
-    memcpy(s->places, w->place, sizeof(double) * s->width);
-    memcpy(s->places + s->width, place, sizeof(double) * s->width);
+    memcpy(s->places, w->place, sizeof(double) * s->span);
+    memcpy(s->places + s->span, place, sizeof(double) * s->span);
     w->pieces = 1;
     w->places = s->places;
     w->floor = w->self_floor = -INFINITY;
@@ -389,18 +430,17 @@ static int pass(StepData *s, int pieces, double spare)
 {
     const Fused *f = s->fused;
     Way *w = s->way;
-    int size = s->width;
+    int size = s->span;
     /* A try before this one may have led away. */
-    int code = is_at(s, s->nodes) ? DONE : lead_to(s, s->nodes);
+    int code = is_at(s, s->points) ? DONE : lead_to(s, s->points);
     if (code) return code;
-    memcpy(s->places, s->nodes, sizeof(double) * size);
+    memcpy(s->places, s->points, sizeof(double) * size);
     for (int k = 1; k < pieces; k++) {
-        double share = (double)k / pieces, *q = (double *)s->place.arg[0];
+        double share = (double)k / pieces, *q = f->work;
         for (int i = 0; i < f->coordinates; i++) q[i] = (1.0 - share) * s->q[i] + share * s->next_q[i];
-        if (call(&s->place)) return NO_VALUE;
-        memcpy(s->places + k * size, s->place.res[0], sizeof(double) * size);
+        if (spread_at(s, q, s->places + k * size)) return NO_VALUE;
     }
-    memcpy(s->places + pieces * size, s->next_nodes, sizeof(double) * size);
+    memcpy(s->places + pieces * size, s->next_points, sizeof(double) * size);
     w->pieces = pieces;
     w->places = s->places;
     w->floor = s->safe + spare;
@@ -411,7 +451,7 @@ static int pass(StepData *s, int pieces, double spare)
 /* Whether the next state, the way to which is proven or not, as `code` says, keeps all clearances itself. */
 static int judge(StepData *s, int code)
 {
-    if (code == NOT_PROVEN && !is_at(s, s->next_nodes) && lead_to(s, s->next_nodes)) return NOT_PROVEN;
+    if (code == NOT_PROVEN && !is_at(s, s->next_points) && lead_to(s, s->next_points)) return NOT_PROVEN;
     if (code && code != NOT_PROVEN) return code;
     return is_clear(s) ? code : TOO_NEAR;
 }
@@ -447,7 +487,7 @@ static int leaps(const StepData *s, const double *q, const double *points)
     return !(furthest < s->leap && norm(q, f->coordinates) + norm(points, 3 * f->vertices) < INFINITY);
 }
 
-/* Write the nodes at q to those of the next state. */
+/* Write the nodes and the points of the bodies at q to those of the next state. */
 static int put_nodes(StepData *s, const double *q)
 {
     const double *nodes = q;
@@ -457,7 +497,7 @@ static int put_nodes(StepData *s, const double *q)
         nodes = s->place.res[0];
     }
     memcpy(s->next_nodes, nodes, sizeof(double) * s->width);
-    return DONE;
+    return s->spread.eval ? spread_at(s, q, s->next_points) : DONE;
 }
 
 /* Check where the answer led, and prove the way there. */
@@ -521,17 +561,17 @@ EXPORT int take(StepData *s)
 {
     double mark = now();
     look_ahead(s);
-    load(s);
-    return solve_step(s, &mark);
+    int code = load(s);
+    return code ? code : solve_step(s, &mark);
 }
 
 /* Go on with a step that asked for contacts. */
 EXPORT int resume(StepData *s)
 {
     double mark = now();
-    use_answers(s);
+    int code = use_answers(s);
     spend(&s->spent[DISTANCE], &mark);
-    return proceed(s, &mark);
+    return code ? code : proceed(s, &mark);
 }
 
 /* Take the step by a further QP, linearised where the last one led, which returns to the constraints by the least
@@ -557,7 +597,8 @@ EXPORT int correct(StepData *s)
     *f->gone = arg[6][0] = 0.0;
     arg[7][0] = f->reached;
     s->corrects = 1;
-    s->at = s->next_nodes;
+    s->at = s->next_points;
+    s->nodes_at = s->next_nodes;
     /* A pair that one correction pushed apart must stay listed for the next, or two corrections alternate. */
     s->reach = fmax(s->reach, f->furthest);
     set_limits(s);

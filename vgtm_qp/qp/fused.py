@@ -367,18 +367,19 @@ class FusedWorkspace:
         return int(near)
 
     def near(self, count: int) -> tuple[Index, Array, Array]:
-        """Return nodes (R, 4), coefficients (R, 4, 3) and bounds (R,) of the first rows of clearance."""
-        nodes, rows = self._near_nodes[: 4 * count], self._near_rows[: 12 * count]
+        """Return nodes (R, S), coefficients (R, S, 3) and bounds (R,) of the first rows of clearance."""
+        slots = self.data.slots
+        nodes, rows = self._near_nodes[: slots * count], self._near_rows[: 3 * slots * count]
         return (
-            nodes.reshape(-1, 4).astype(np.int64),
-            rows.reshape(-1, 4, 3).copy(),
+            nodes.reshape(-1, slots).astype(np.int64),
+            rows.reshape(-1, slots, 3).copy(),
             self._near_lower[:count].copy(),
         )
 
-    def reserve(self, near: int) -> None:
-        """Make room for `near` rows of clearance at least."""
-        if near > self._room:
-            self._reserve(near, self._slots)
+    def reserve(self, near: int, slots: int) -> None:
+        """Make room for `near` rows of clearance over `slots` nodes at least."""
+        if near > self._room or slots > self._slots:
+            self._reserve(max(near, self._room), max(slots, self._slots))
 
     def closed(self) -> Closed:
         """Return the settled configuration."""

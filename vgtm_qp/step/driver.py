@@ -10,13 +10,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from itertools import pairwise
 from time import perf_counter
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from vgtm_qp.arm.arm import Pose, tip_function
-from vgtm_qp.arrays import record
+from vgtm_qp.arm.arm import Arm, Ends, Pose, tip_function
+from vgtm_qp.arrays import Array, record
 from vgtm_qp.geometry.exact import CONTACT, NORMAL_FROM, PROOF
+from vgtm_qp.geometry.groups import Scene
 from vgtm_qp.geometry.pairs import Pair
 from vgtm_qp.geometry.watch import AHEAD, Watch
 from vgtm_qp.native import Code, Program
@@ -62,8 +63,8 @@ PHASES = "distance", "qp", "acceptance"
 
 _NO_ROWS = ClearanceRows()
 
-_ROOM = 64
-"""Capacity at first: rows of clearance."""
+_ROOM, _SLOTS = 64, 4
+"""Capacity at first: rows of clearance; points of a row."""
 
 
 class Passage(NamedTuple):
@@ -135,6 +136,8 @@ class Driver:
         self._setup, self._accuracy, self._separation = setup, accuracy, separation
         self._solver, self._layout = engine.solver, engine.layout
         self._work, self._known = self._solver.workspace, setup.arm.arithmetic()
+        self._ends = None if self._known is None else self._known.ends
+        self._points: Array | None = None
         self._held: State | None = None
         self._watch: Watch | None = None
         self.spent = np.zeros(len(PHASES))
@@ -166,12 +169,13 @@ class Driver:
         if watch is None:
             data.way = 0
         else:
-            data.way = watch.started(state.nodes).address
+            data.way = watch.started(state.nodes if self._points is None else self._points).address
             watch.refresh()
         code = self._called(self._take)
         if code == Code.ELSEWHERE:
             assert watch is not None
-            data.way = watch.move_to(state.nodes, data.limit, data.self_limit).address
+            at = state.nodes if self._points is None else self._points
+            data.way = watch.move_to(at, data.limit, data.self_limit).address
             code = self._called(self._take)
         if code == Code.DONE:
             return self._passage(state, target)
@@ -310,21 +314,9 @@ class Driver:
             *work.near(near), name, data.proven, (data.asked_for if data.asks else near) - data.proven
         )
 
-    def _of_fcl(self) -> dict[str, float]:
-        """Return by field what the C knows of FCL."""
-        scene = self._setup.monitor.scene
-        if scene.fcl is None:
-            return {"asks": 0}
-        return {
-            "asks": 1,
-            "scale": scene.fcl.scale,
-            "flaw": PROOF * scene.unit,
-            "apart": NORMAL_FROM * scene.unit,
-        }
-
     def _make_room(self, rows: int) -> None:
         """Make room for that many rows of clearance."""
-        self._work.reserve(rows)
+        self._work.reserve(rows, _SLOTS if self._ends is None else 3 * _SLOTS)
         self._contacts, self._questions, self._answers = (np.zeros((rows, n)) for n in (CONTACT, 12, 7))
         self._group, self._pair, self._asked = (np.zeros(rows, dtype=np.int32) for _ in range(3))
         self._program.set(
@@ -370,6 +362,12 @@ class Driver:
             program.set(levers=known.levers)
         if setup.task.turns is not None:
             program.set(frame=tip_function(arm).kernel())
+        points: dict[str, Any] = {
+            "points": self._before[self._parts[1]],
+            "next_points": self._after[self._parts[1]],
+        }
+        points |= _of_points(arm, self._ends)
+        self._points = None if self._ends is None else points["points"]
         self._take, self._resume, self._correct = map(program.entry, ("take", "resume", "correct"))
         program.set(
             fused=work.address,
@@ -391,7 +389,7 @@ class Driver:
             tip_weight=np.ascontiguousarray(tip.weights, dtype=float),
             influence=setup.influence,
             margin=setup.margin,
-            **self._of_fcl(),
+            **_of_fcl(setup.monitor.scene),
             motion_margin=MOTION_MARGIN,
             ahead=AHEAD,
             furthest=SINGULAR * arm.height,
@@ -401,10 +399,10 @@ class Driver:
             tracking=self._accuracy.tracking,
             relative=ROUNDING,
             tolerance=TOLERANCE,
-            places=np.zeros((MOST_PIECES + 1, *arm.home.shape)),
             spent=self.spent,
             **self._separation.pace,
             **_of_curve(layout),
+            **points,
         )
         self._started = True
 
@@ -419,4 +417,38 @@ def _of_curve(layout: Layout) -> dict[str, object]:
         "must_track": int(layout.hard_tracking and not layout.hard_turns),
         "end_gain": np.ascontiguousarray(layout.end_gain),
         "base_normal": np.ascontiguousarray(layout.arm.stations.frames[0][:, 2]),
+    }
+
+
+def _of_fcl(scene: Scene) -> dict[str, float]:
+    """Return by field what the C knows of FCL."""
+    if scene.fcl is None:
+        return {"asks": 0}
+    return {
+        "asks": 1,
+        "scale": scene.fcl.scale,
+        "flaw": PROOF * scene.unit,
+        "apart": NORMAL_FROM * scene.unit,
+    }
+
+
+def _of_points(arm: Arm, ends: Ends | None) -> dict[str, object]:
+    """Return by field what the C knows of the points of the bodies, where these are not the nodes."""
+    home = arm.points(arm.home_configuration)
+    found: dict[str, object] = {
+        "places": np.zeros((MOST_PIECES + 1, *home.shape)),
+        "span": home.size,
+        "slots": _SLOTS,
+    }
+    if ends is None:
+        return found
+    # The points at home are the first place of the watch; the C writes those of each state.
+    return found | {
+        "points": home.copy(),
+        "next_points": home.copy(),
+        "spread": ends.place,
+        "end": ends.row,
+        "end_nodes": np.ascontiguousarray(ends.nodes, dtype=np.int32),
+        "offset": np.ascontiguousarray(ends.offset),
+        "slots": 3 * _SLOTS,
     }

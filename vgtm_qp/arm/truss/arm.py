@@ -8,11 +8,22 @@ from typing import Any
 
 import numpy as np
 
-from vgtm_qp.arm.arm import Arithmetic, Arm, Kinematics, Label, MotionPattern, Newton, Pose, Stations, Tip
+from vgtm_qp.arm.arm import (
+    Arithmetic,
+    Arm,
+    Ends,
+    Kinematics,
+    Label,
+    MotionPattern,
+    Newton,
+    Pose,
+    Stations,
+    Tip,
+)
 from vgtm_qp.arm.frames import frame_constants
 from vgtm_qp.arm.symbols import Constants
-from vgtm_qp.arm.truss.bounds import chord_deviation, frame_deviation, hollow, longest_paths
-from vgtm_qp.arm.truss.kinematics import EndKinematics, LengthRows, length_gradients, solved
+from vgtm_qp.arm.truss.bounds import bend_function, frame_deviation, hollow, longest_paths
+from vgtm_qp.arm.truss.kinematics import EndKinematics, LengthRows, length_gradients, place_function, solved
 from vgtm_qp.arm.truss.lengths import LengthSolver
 from vgtm_qp.arm.truss.mobility import TrussDescription, describe
 from vgtm_qp.arm.truss.symbols import TrussSymbols
@@ -21,6 +32,7 @@ from vgtm_qp.arrays import Array, Index
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.errors import TrussError
 from vgtm_qp.geometry.bodies import capsules
+from vgtm_qp.rows.members import end_function
 
 
 class TrussArm(Arm):
@@ -68,10 +80,15 @@ class TrussArm(Arm):
 
     def arithmetic(self) -> Arithmetic | None:
         """See ``arm.Arm``; with offset joints the ends of members are no nodes."""
-        if self.truss.joints is not None:
-            return None
-        based = np.flatnonzero(np.repeat(self.base, 3))
-        return Arithmetic(None, None, True, self._first, self._last, np.zeros(len(self._first)), None, based)
+        truss, based = self.truss, np.flatnonzero(np.repeat(self.base, 3))
+        bend, ends = None, None
+        if truss.joints is not None:
+            nodes, offset = truss.joints.triangle[truss.members], truss.joints.offset
+            kernels = place_function(truss).kernel(), Kernel(end_function())
+            ends = Ends(*kernels, nodes.reshape(-1, 3), offset.reshape(-1, 3))
+            bend = bend_function(truss).kernel()
+        lengths = True, self._first, self._last, np.zeros(len(self._first))
+        return Arithmetic(None, bend, *lengths, None, based, ends)
 
     def measured(self, q: Array) -> Array:
         """See ``arm.Arm``: the distances of the members' ends."""
@@ -141,8 +158,20 @@ class TrussArm(Arm):
         return describe(self.truss).unreachable
 
     def deviation(self, start: Array, end: Array) -> float:
-        """See ``arm.Arm``: offset joints turn during the motion."""
-        return 2.0 * chord_deviation(self.truss, start, end)
+        """See ``arm.Arm``: offset joints turn during the motion.
+
+        A curve is no further from its chord than an eighth of the greatest second derivative.
+        """
+        if self.truss.joints is None:
+            return 0.0
+        kernel = self._bend
+        kernel.inputs[0][:], kernel.inputs[1][:] = start.reshape(-1), end.reshape(-1)
+        kernel()
+        return 0.25 * float(kernel.outputs[0][0])
+
+    @cached_property
+    def _bend(self) -> Kernel:
+        return bend_function(self.truss).kernel()
 
     def tip_deviation(self, start: Array, end: Array, reach: float) -> float:
         """See ``arm.Arm``: infinite where the tip turns too far for a bound."""

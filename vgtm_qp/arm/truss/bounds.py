@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import dijkstra
 
+from vgtm_qp.arm.symbols import Bound, Constants
 from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.arrays import Array, Index
 
@@ -45,49 +45,42 @@ def hollow(truss: Truss) -> float:
     return float((longest_paths(truss, tip)[:, tip] @ np.abs(truss.tip_weights)).min()) + offset
 
 
-class _Bounds(NamedTuple):
-    """Bounds of the first two derivatives of a unit vector, one per node; inf if unbounded."""
+def bend_function(truss: Truss) -> Bound:
+    """Return the function of a bound of |r''| of all members' ends where nodes move straight, given twice, m.
 
-    first: Array
-    second: Array
-
-
-def chord_deviation(truss: Truss, start: Array, end: Array) -> float:
-    """Return a bound, m, of how far a member's end is from its chord where nodes (N, 3) move straight; inf without one.
-
-    An end is r = rho + R o, eq. (13), and the axes of the joint's frame R are unit vectors of polynomials w of the
-    share of the motion. From |w| >= m, |w'| <= a and |w''| <= b follow |(w/|w|)'| <= a/m and
-    |(w/|w|)''| <= b/m + 3 (a/m)^2, and a curve is no further from its chord than an eighth of the greatest second
-    derivative.
+    Arguments: nodes (3, N) at both ends of the motion. An end is r = rho + R o, eq. (13), and the axes of the joint's
+    frame R are unit vectors of polynomials w of the share of the motion. From |w| >= m, |w'| <= a and |w''| <= b follow
+    |(w/|w|)'| <= a/m and |(w/|w|)''| <= b/m + 3 (a/m)^2. Infinite where one has no bound.
     """
-    joints = truss.joints
-    if joints is None:
-        return 0.0
-    before, after = (_sides(X[joints.triangle]) for X in (start, end))
-    change = after - before
-    greatest = np.maximum(_norm(before), _norm(after))
-    unit = [_unit(before[k], after[k], _norm(change[k]), np.zeros(len(change[k]))) for k in range(2)]
-    normalised = [sides / _norm(sides)[..., None] for sides in (before, after)]
-    x = _unit(
-        normalised[0].sum(axis=0),
-        normalised[1].sum(axis=0),
-        unit[0].first + unit[1].first,
-        unit[0].second + unit[1].second,
-    )
-    moved = _norm(change)
-    z = _unit(
-        np.cross(before[0], before[1]),
-        np.cross(after[0], after[1]),
-        moved[0] * greatest[1] + moved[1] * greatest[0],
-        2.0 * moved[0] * moved[1],
-    )
-    with np.errstate(invalid="ignore"):
-        y = z.second + 2.0 * z.first * x.first + x.second
-        node = truss.members
-        offset = np.abs(joints.offset)
-        bend = offset[..., 0] * x.second[node] + offset[..., 1] * y[node] + offset[..., 2] * z.second[node]
-    bend[offset.max(axis=2) == 0.0] = 0.0
-    return float(np.nan_to_num(bend, nan=np.inf).max(initial=0.0)) / 8.0
+    assert truss.joints is not None
+    constants = Constants()
+    ends = [ca.MX.sym(name, 3, truss.node_count) for name in ("start", "end")]
+    corners = [X[:, truss.joints.triangle.reshape(-1).tolist()] for X in ends]
+    axes = _axes_bend().map(truss.node_count)(*corners)
+    offsets = constants.add("offsets", np.abs(truss.joints.offset).reshape(-1, 3))
+    bend, offset = ca.SX.sym("bend", 3), ca.SX.sym("offset", 3)
+    bound = ca.dot(offset, bend)
+    # Infinity times zero is no number.
+    bound = ca.if_else(ca.mmax(offset) > 0.0, ca.if_else(bound < np.inf, bound, np.inf), 0.0)
+    of_end = ca.Function("of_end", [bend, offset], [bound])
+    worst = ca.mmax(of_end.map(2 * truss.member_count)(axes[:, truss.members.reshape(-1).tolist()], offsets))
+    return constants.bound("bend", ends, [ca.vertcat(worst, worst)])
+
+
+def _axes_bend() -> ca.Function:
+    """Return corners (3, 3) of a joint's triangle, before and after -> bounds of the second derivatives of its axes."""
+    corners = [ca.SX.sym("before", 3, 3), ca.SX.sym("after", 3, 3)]
+    before, after = ([ring[:, k] - ring[:, 0] for k in (1, 2)] for ring in corners)
+    sides = list(zip(before, after, strict=True))
+    moved = [ca.norm_2(side[1] - side[0]) for side in sides]
+    longest = [ca.fmax(ca.norm_2(side[0]), ca.norm_2(side[1])) for side in sides]
+    units = [_unit_bounds(*side, way, ca.SX(0.0)) for side, way in zip(sides, moved, strict=True)]
+    across = [ring[0] / ca.norm_2(ring[0]) + ring[1] / ca.norm_2(ring[1]) for ring in (before, after)]
+    x1, x2 = _unit_bounds(across[0], across[1], units[0][0] + units[1][0], units[0][1] + units[1][1])
+    rate = moved[0] * longest[1] + moved[1] * longest[0]
+    normals = [ca.cross(ring[0], ring[1]) for ring in (before, after)]
+    z1, z2 = _unit_bounds(normals[0], normals[1], rate, 2.0 * moved[0] * moved[1])
+    return ca.Function("axes_bend", corners, [ca.vertcat(x2, z2 + 2.0 * z1 * x1 + x2, z2)])
 
 
 def frame_deviation(count: int) -> ca.Function:
@@ -133,22 +126,3 @@ def _unit_bounds(before: ca.SX, after: ca.SX, first: ca.SX, second: ca.SX) -> tu
     least = (ca.norm_2(before) + ca.norm_2(after) - first) / 2.0
     relative = ca.if_else(least > 0.0, first / least, np.inf)
     return relative, ca.if_else(least > 0.0, second / least + 3.0 * relative**2, np.inf)
-
-
-def _unit(before: Array, after: Array, first: Array, second: Array) -> _Bounds:
-    """Return the bounds for w/|w| from w (N, 3) at both ends and bounds of its derivatives (N,)."""
-    least = (_norm(before) + _norm(after) - first) / 2.0
-    with np.errstate(divide="ignore", invalid="ignore"):
-        relative = first / least
-        bend = second / least + 3.0 * relative**2
-    held = least > 0.0
-    return _Bounds(np.where(held, relative, np.inf), np.where(held, bend, np.inf))
-
-
-def _sides(corner: Array) -> Array:
-    """Return (2, N, 3) the sides of the joints' triangles that meet at their nodes."""
-    return np.stack([corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]])
-
-
-def _norm(vectors: Array) -> Array:
-    return np.asarray(np.linalg.norm(vectors, axis=-1))

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from typing import Any
 
+import casadi as ca
 import numpy as np
 from scipy.sparse.linalg import splu
 
+from vgtm_qp.arm.symbols import Bound, Constants
 from vgtm_qp.arm.truss.joints import Joints
 from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.errors import SolverError
-from vgtm_qp.rows.members import end_function, member_function
+from vgtm_qp.rows.members import end_function, member_end, member_function
 
 _DENSE = 150
 """Greatest number of node coordinates for which dense LAPACK is faster than a sparse factorisation."""
@@ -28,6 +30,17 @@ def length_gradients(truss: Truss, X: Array) -> Array:
     function = member_function(has_offsets=truss.joints is not None)
     _, gradients = function.map(truss.member_count)(*arguments)
     return np.asarray(gradients).T.reshape(truss.member_count, -1, 3)
+
+
+def place_function(truss: Truss) -> Bound:
+    """Return the function from nodes (3, N) to the ends (3, 2 M) of all members in offset joints, m."""
+    assert truss.joints is not None
+    constants, X = Constants(), ca.MX.sym("X", 3, truss.node_count)
+    corners, offset = ca.SX.sym("corners", 3, 3), ca.SX.sym("offset", 3)
+    end = ca.Function("end", [corners, offset], [member_end(corners, offset)])
+    nodes = truss.joints.triangle[truss.members].reshape(-1).tolist()
+    offsets = constants.add("offsets", truss.joints.offset.reshape(-1, 3))
+    return constants.bound("ends", [X], [end.map(2 * truss.member_count)(X[:, nodes], offsets)])
 
 
 class EndKinematics:
