@@ -202,10 +202,10 @@ class Driver:
 
     def corrected(self, state: State, target: Target, begun: Begun, code: int) -> Passage | Begun | Lost:
         """Return the step by further QPs after the first one, which ended with `code`; its beginning if unusual."""
-        data, first, covered = self._program.data, begun.first, 1.0
+        first, covered = begun.first, 1.0
+        if code == Code.NOT_PROVEN:
+            return begun
         for qps in range(2, MOST_QPS + 1):
-            if code not in _AGAIN:
-                return begun
             if qps > FREE_QPS and covered == 1.0 and is_cut_short(self._setup, first):
                 covered = first.progress
                 self._cut(target.part(covered), first)
@@ -215,10 +215,21 @@ class Driver:
             if found is not None:
                 progress = covered * found.progress
                 return Passage(found.state, progress, found.gap, first.solution, begun.rows, qps)
-            if code == Code.NOT_PROVEN:
-                move = self._solver.led(state.torsion, is_settled=True)
-                return begun._replace(move=move, reach=data.reach, qps=qps, covered=covered)
-        return Lost(first.solution, begun.rows) if code in _AGAIN else begun
+            if code not in _AGAIN:
+                return self._left(begun, qps, covered, code)
+        return Lost(first.solution, begun.rows)
+
+    def _left(self, begun: Begun, qps: int, covered: float, code: int) -> Begun:
+        """Return what is left to an attempt after QPs of which the last ended with `code`: a proof, or that QP."""
+        first, work = begun.first, self._work
+        if code == Code.NOT_PROVEN:
+            move = self._solver.led(first.torsion, is_settled=True)
+        else:
+            # Where the QP before it led, as far as this one knows.
+            q, vertices, progress = (work.condense.inputs[k].copy() for k in (0, 3, 7))
+            place = q.reshape(work.shape), vertices.reshape(-1, 3), first.torsion
+            move, qps = Move(first.solution, *place, float(progress[0]), 0.0, None), qps - 1
+        return begun._replace(move=move, reach=self._program.data.reach, qps=qps, covered=covered)
 
     def _cut(self, target: Target, first: Move) -> None:
         """Go back to where the `first` answer led, at the end of the `target`."""
