@@ -9,15 +9,16 @@ import casadi as ca
 import numpy as np
 import pytest
 from recorded_states import CASES
-from steps import drives_nothing
+from steps import drives_nothing, solved
 
 import vgtm_qp as vq
 from vgtm_qp.compiled import Kernel, compiler, finish_compiling
 from vgtm_qp.native import building
 from vgtm_qp.problem.obstacle import Sphere
 from vgtm_qp.qp import fused
+from vgtm_qp.qp.residual import InfeasibleStepError
 from vgtm_qp.rotation import rotation_from_vector, vector_from_rotation
-from vgtm_qp.step.driver import Begun, Driver, Lost, Passage
+from vgtm_qp.step.driver import Begun, Denied, Driver, Lost, Passage
 from vgtm_qp.step.path import Path
 from vgtm_qp.study.scenes import random_scene
 from vgtm_qp.study.serial_scenes import random_serial_scene
@@ -160,7 +161,16 @@ def far_goals(resolver: vq.Resolver, rng: np.random.Generator, count: int) -> It
 def test_further_qps_are_those_of_an_attempt(name, driven, monkeypatch, rng):
     problem = problem_of_two_qps(FURTHER[name][0], **FURTHER[name][1])
     one, other = vq.Resolver(problem), vq.Resolver(problem)
-    found, apart = [], []
+    found, apart, corrected = [], [], Driver.corrected
+
+    def told(self, state, target, begun, code):
+        taken = corrected(self, state, target, begun, code)
+        if not isinstance(taken, Begun):
+            assert taken.solution is begun.first.solution
+            assert taken.rows is begun.rows
+        return taken
+
+    monkeypatch.setattr(Driver, "corrected", told)
     for goal in far_goals(one, rng, 25):
         other.state = one.state
         with monkeypatch.context() as patch:
@@ -172,9 +182,6 @@ def test_further_qps_are_those_of_an_attempt(name, driven, monkeypatch, rng):
         # Settling that ends one iteration sooner or later by rounding moves a state by some 1e-11 m, which may grow.
         assert_same(step, expected, 1e3 * SAME)
         apart.append(np.abs(step.state.q - expected.state.q).max())
-        if step.solution is not None:
-            assert step.solution.iterations == expected.solution.iterations
-            np.testing.assert_array_equal(step.rows.nodes, expected.rows.nodes)
         found.append(step.qps)
     assert max(found) > 1
     assert np.mean(np.array(apart) < SAME) > 0.8
@@ -202,6 +209,28 @@ def test_most_steps_of_further_qps_are_taken_by_calls(monkeypatch):
     ]
     assert sum(isinstance(one, Passage) and one.qps == 2 for one in further) >= 10
     assert np.mean([isinstance(one, Begun) for one in further]) < 0.1
+
+
+@pytest.mark.parametrize("name", ["octahedral", "offset joints"])
+def test_a_qp_of_which_a_call_says_so_has_no_answer(name, monkeypatch):
+    assert building().finish() is not None
+    found, take = [], Driver.take
+
+    def kept(self, *asked):
+        found.append(take(self, *asked))
+        return found[-1]
+
+    monkeypatch.setattr(Driver, "take", kept)
+    resolver = vq.Resolver(problem_of_two_qps(FURTHER[name][0]))
+    # Far out and against the cubes stations cannot stay on the curve.
+    ways = np.random.default_rng(1).normal(size=(4, 3))
+    for way in np.repeat(ways / np.linalg.norm(ways, axis=1, keepdims=True), 15, axis=0):
+        resolver.step(position=resolver.tip()[0] + 0.05 * way)
+    denied = [one for one in found if isinstance(one, Denied)]
+    assert len(denied) > 3
+    for one in denied[:: len(denied) // 3]:
+        with pytest.raises((InfeasibleStepError, AssertionError)):
+            solved(resolver.setup.engine.qp(one.asked))
 
 
 def lying(make, change):
@@ -343,15 +372,16 @@ def test_the_rows_of_offset_joints_are_those_of_an_attempt(name, driven, rng):
     for goal in goals(one, rng, 20):
         other.state = one.state
         found, expected = one.step(**goal), other.step(**goal)
-        if found.qps == expected.qps == 1 and found.moved:
-            names = [[step.rows.name(k) for k in range(len(step.rows))] for step in (found, expected)]
-            first, second = (sorted(range(len(own)), key=own.__getitem__) for own in names)
-            assert [names[0][k] for k in first] == [names[1][k] for k in second]
-            if len(set(names[0])) == len(names[0]) > 0:
-                counted += 1
-                for part in ("nodes", "coefficients", "lower"):
-                    pair = getattr(found.rows, part)[first], getattr(expected.rows, part)[second]
-                    np.testing.assert_allclose(*pair, atol=1e-12)
+        if found.qps == expected.qps == 1 and found.moved and len(found.rows):
+            counted += 1
+            first, second = (
+                sorted(range(len(rows)), key=lambda k, rows=rows: (rows.name(k), round(rows.lower[k], 9)))
+                for rows in (found.rows, expected.rows)
+            )
+            assert [found.rows.name(k) for k in first] == [expected.rows.name(k) for k in second]
+            for part in ("nodes", "coefficients", "lower"):
+                pair = getattr(found.rows, part)[first], getattr(expected.rows, part)[second]
+                np.testing.assert_allclose(*pair, atol=1e-12)
     assert counted
     assert np.mean(driven) > 0.5
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from vgtm_qp.arrays import Array
 from vgtm_qp.qp.dense import DenseAnswer
-from vgtm_qp.qp.residual import InfeasibleStepError
+from vgtm_qp.qp.residual import CONTRADICTION, InfeasibleStepError
 
 
 class Daqp:
@@ -30,7 +30,7 @@ class Daqp:
             hessian, gradient, constraint, upper, lower, sense, primal_tol=self.accuracy, eps_prox=0.0
         )
         if flag == -1:
-            raise InfeasibleStepError("the hard rows of the step contradict one another")
+            raise InfeasibleStepError(CONTRADICTION)
         status = f"daqp (exit flag {flag})"
         return DenseAnswer(x, np.asarray(info["lam"]), int(info["iterations"]), status, flag > 0)
 

@@ -28,7 +28,7 @@ from vgtm_qp.qp.fused_rows import RESULTS, row_function
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.linearise import StepInput
 from vgtm_qp.qp.numbers import UNBOUNDED, ClearanceRows
-from vgtm_qp.qp.residual import TOLERANCE, InfeasibleStepError, refuse_large
+from vgtm_qp.qp.residual import CONTRADICTION, TOLERANCE, InfeasibleStepError, refuse_large
 from vgtm_qp.qp.settle import (
     AT_BOUND,
     LEFT,
@@ -301,7 +301,7 @@ class FusedWorkspace:
         if failure is not None:
             raise failure
         if code == Code.INFEASIBLE:
-            raise InfeasibleStepError("the hard rows of the step contradict one another")
+            raise InfeasibleStepError(CONTRADICTION)
         if code == Code.NO_VALUE:
             raise EvaluationError("the rows of the step have no value at its configuration")
         return code

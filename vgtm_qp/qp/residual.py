@@ -23,6 +23,9 @@ checked separately, to 1e-10 m.
 """
 
 
+CONTRADICTION = "the hard rows of the step contradict one another"
+
+
 class FailedStepError(SolverError):
     """The QP of a step has no answer, or no accurate one was found.
 

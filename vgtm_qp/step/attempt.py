@@ -15,7 +15,7 @@ from vgtm_qp.errors import CurveError, EvaluationError, SolverError
 from vgtm_qp.qp.answer import Accuracy, Closed, Move
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.numbers import ClearanceRows
-from vgtm_qp.qp.residual import AnswerError, FailedStepError, InfeasibleStepError
+from vgtm_qp.qp.residual import CONTRADICTION, AnswerError, FailedStepError, InfeasibleStepError
 from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.acceptance import Acceptance
 from vgtm_qp.step.actuation import Actuation
@@ -28,6 +28,7 @@ from vgtm_qp.step.driver import (
     PHASES,
     SINGULAR,
     Begun,
+    Denied,
     Driver,
     Lost,
     can_drive,
@@ -208,6 +209,11 @@ class Attempt:
         of_qps: dict[str, Any] = {"qps": qps, "solution": taken.solution, "rows": taken.rows}
         if isinstance(taken, Lost):
             return Step(StepStatus.BLOCKED, 0.0, state, _NO_CONVERGENCE, **of_qps)
+        if isinstance(taken, Denied):
+            asked, error = taken.asked, InfeasibleStepError(CONTRADICTION)
+            error.build = lambda: engine.qp(asked)
+            reason, failure, _ = _reason(error)
+            return Step(StepStatus.BLOCKED, 0.0, state, reason, failure=failure, **of_qps)
         return self._accepted(taken.state, taken.progress, taken.gap, **of_qps)
 
     def _recovery(self, short: Shortfall) -> float:

@@ -32,7 +32,7 @@ from vgtm_qp.step.separation import MOST_PIECES, Separation
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import State
 from vgtm_qp.step.step import WHOLE
-from vgtm_qp.step.target import Target
+from vgtm_qp.step.target import QPInput, Target
 
 MOTION_MARGIN = 2.5
 """Ratio of the displacement for which pairs are listed to the expected displacement of a node."""
@@ -57,6 +57,9 @@ _NOTHING = 1e-9
 
 _AGAIN = Code.UNSETTLED, Code.TOO_NEAR, Code.OFF_CURVE
 """How a QP ends that another one may correct."""
+
+_WANTING = Code.ASKS, Code.CROWDED
+"""How a call ends that is to be answered, and goes on then."""
 
 PHASES = "distance", "qp", "acceptance"
 """Parts of a step whose times are known."""
@@ -110,6 +113,18 @@ class Lost(NamedTuple):
     rows: ClearanceRows
 
 
+class Denied(NamedTuple):
+    """A step whose QP of that number has no answer: its input, and answer and rows of the first one if that has."""
+
+    asked: QPInput
+    qps: int
+    solution: StepSolution | None = None
+    rows: ClearanceRows | None = None
+
+
+Taken = Passage | Begun | Lost | Denied
+
+
 def can_drive(setup: Setup) -> bool:
     """Return whether usual steps of an arm can be taken in one call, if its ``Arm.arithmetic`` is known."""
     layout = setup.layout
@@ -143,7 +158,7 @@ class Driver:
         self.spent = np.zeros(len(PHASES))
         self._started = self._is_placed = False
 
-    def take(self, state: State, target: Target, share: float) -> Passage | Begun | Lost | None:
+    def take(self, state: State, target: Target, share: float) -> Taken | None:
         """Return the step from `state`, in which no pair is too near, to the end of the target's piece of path.
 
         The motion of the step before, times `share`, predicts this one. None if nothing is known of the step.
@@ -172,6 +187,8 @@ class Driver:
             data.way = watch.started(state.nodes if self._points is None else self._points).address
             watch.refresh()
         code = self._called(self._take)
+        if not code:
+            return self._passage(state, target)
         if code == Code.ELSEWHERE:
             assert watch is not None
             at = state.nodes if self._points is None else self._points
@@ -182,25 +199,25 @@ class Driver:
         if code in _AGAIN or code == Code.NOT_PROVEN:
             first = self._solver.led(state.torsion, is_settled=bool(data.settled))
             return self.corrected(state, target, Begun(first, first, self._rows(), data.reach), code)
-        return None
+        return _denied(state, target, share, self._rows()) if code == Code.INFEASIBLE else None
 
     def _called(self, call: Callable[[], int]) -> int:
         """Return how a QP ended that a `call` solves, where what it asks for is answered, and there is enough room."""
         code, data = call(), self._program.data
-        while code == Code.ASKS or code == Code.CROWDED:
+        while code and code in _WANTING:
             if code == Code.ASKS:
                 self._ask()
                 code = self._resume()
             else:
                 self._make_room(2 * data.room)
                 code = call()
-        if data.asked_for and (code == Code.DONE or code in _AGAIN):
+        if data.asked_for and (not code or code in _AGAIN):
             fcl = self._setup.monitor.scene.fcl
             assert fcl is not None
             fcl.refused += data.asked_for - data.proven
         return code
 
-    def corrected(self, state: State, target: Target, begun: Begun, code: int) -> Passage | Begun | Lost:
+    def corrected(self, state: State, target: Target, begun: Begun, code: int) -> Taken:
         """Return the step by further QPs after the first one, which ended with `code`; its beginning if unusual."""
         first, covered = begun.first, 1.0
         if code == Code.NOT_PROVEN:
@@ -216,10 +233,10 @@ class Driver:
                 progress = covered * found.progress
                 return Passage(found.state, progress, found.gap, first.solution, begun.rows, qps)
             if code not in _AGAIN:
-                return self._left(begun, qps, covered, code)
+                return self._left(target, begun, qps, covered, code)
         return Lost(first.solution, begun.rows)
 
-    def _left(self, begun: Begun, qps: int, covered: float, code: int) -> Begun:
+    def _left(self, target: Target, begun: Begun, qps: int, covered: float, code: int) -> Begun | Denied:
         """Return what is left to an attempt after QPs of which the last ended with `code`: a proof, or that QP."""
         first, work = begun.first, self._work
         if code == Code.NOT_PROVEN:
@@ -227,9 +244,10 @@ class Driver:
         else:
             # Where the QP before it led, as far as this one knows.
             q, vertices, progress = (work.condense.inputs[k].copy() for k in (0, 3, 7))
-            place = q.reshape(work.shape), vertices.reshape(-1, 3), first.torsion
-            move, qps = Move(first.solution, *place, float(progress[0]), 0.0, None), qps - 1
-        return begun._replace(move=move, reach=self._program.data.reach, qps=qps, covered=covered)
+            at = q.reshape(work.shape), vertices.reshape(-1, 3), first.torsion
+            move, qps = Move(first.solution, *at, float(progress[0]), 0.0, None), qps - 1
+        begun = begun._replace(move=move, reach=self._program.data.reach, qps=qps, covered=covered)
+        return _corrects_nothing(target, begun, self._rows()) if code == Code.INFEASIBLE else begun
 
     def _cut(self, target: Target, first: Move) -> None:
         """Go back to where the `first` answer led, at the end of the `target`."""
@@ -416,6 +434,22 @@ class Driver:
             **points,
         )
         self._started = True
+
+
+def _denied(state: State, target: Target, share: float, rows: ClearanceRows) -> Denied | None:
+    """Return the step whose first QP, with these `rows`, has no answer; None if it may have one without the margin."""
+    if len(rows) and rows.lower.max() > 0.0:
+        return None
+    at, curve = state.q + 0.5 * share * state.motion, (state.control_vertices, state.torsion)
+    return Denied(QPInput(state.q, at, *curve, target, target.goal(0.0), 0.0, rows, True), 1)
+
+
+def _corrects_nothing(target: Target, begun: Begun, rows: ClearanceRows) -> Denied:
+    """Return the step whose next QP after its beginning, with these `rows`, has no answer."""
+    move, target = begun.move, target if begun.covered == 1.0 else target.part(begun.covered)
+    point = move.q, move.q, move.vertices, move.torsion
+    asked = QPInput(*point, target, target.goal(move.progress), move.progress, rows, False)
+    return Denied(asked, begun.qps + 1, begun.first.solution, begun.rows)
 
 
 def _of_curve(layout: Layout) -> dict[str, object]:
