@@ -187,8 +187,70 @@ def test_further_qps_are_those_of_an_attempt(name, driven, monkeypatch, rng):
     assert np.mean(np.array(apart) < SAME) > 0.8
 
 
-def test_most_steps_are_usual(driven):
-    maneuver = vq.solve(vq.load_problem("five_bay_two_cubes"))
+def on_a_moving_base(problem: vq.Problem, rng: np.random.Generator) -> vq.Problem:
+    """The problem on a base that moves and turns, and then rests."""
+    setup, table = vq.Resolver(problem).setup, "arm" if problem.truss is None else "truss"
+    poses = [
+        {
+            "time": steps * setup.dt,
+            "position": (0.02 * setup.arm.unit * rng.normal(size=3)).tolist(),
+            "rotation_vector": (0.02 * rng.normal(size=3)).tolist(),
+        }
+        for steps in (2.5, 6.0)
+    ]
+    return problem.replace({f"{table}.base_motion": poses})
+
+
+@pytest.mark.parametrize("name", ["five_bay_two_cubes", "snake_past_a_cube", "twelve_joints_past_a_crate"])
+def test_it_takes_the_steps_of_arms_on_moving_bases(name, driven, rng):
+    compare(on_a_moving_base(vq.load_problem(name), rng), rng, 10, SAME)
+    assert any(driven)
+
+
+@pytest.mark.parametrize(
+    ("name", "body"), [("five_bay_free", 0), ("moving_base", 4), ("snake_past_a_cube", 2)]
+)
+def test_a_body_that_the_base_pushes_onto_a_ball_gives_way(name, body, driven):
+    problem = vq.load_problem(name)
+    setup, table = vq.Resolver(problem).setup, "arm" if problem.truss is None else "truss"
+    ends = setup.arm.bodies.some(setup.arm.home)[body]
+    middle, aside = ends.mean(axis=0), np.cross(ends[1] - ends[0], [0.0, -1.0, 0.0])
+    aside *= np.copysign(1.0 / np.linalg.norm(aside), middle[0] * aside[0])
+    way = setup.arm.bodies.radius[body] + setup.safe + 0.005 + 0.1
+    ball = {"name": "ball", "shape": "sphere", "center": (middle + way * aside).tolist(), "radius": 0.1}
+    motion = [{"time": 20 * setup.dt, "position": (0.04 * aside).tolist()}]
+    problem = problem.replace({"obstacle": [ball], f"{table}.base_motion": motion})
+    one, other = vq.Resolver(problem), without(problem)
+    pressed = 0
+    driven.clear()
+    for _ in range(12):
+        other.state = before = one.state
+        found, expected = one.step(position=one.tip()[0]), other.step(position=one.tip()[0])
+        assert found.qps == expected.qps == 1
+        assert_same(found, expected, SAME)
+        # What the base does to other nodes counts once.
+        moved = np.where(setup.arm.base[:, None], 0.0, found.state.nodes - before.nodes)
+        for rows, solution in ((found.rows, found.solution), (expected.rows, expected.solution)):
+            value = np.einsum("rsc,rsc->r", rows.coefficients, moved[rows.nodes])
+            presses = solution.clearance_multipliers > 1e-9
+            np.testing.assert_allclose(value[presses], rows.lower[presses], atol=2e-4)
+        pressed += presses.any()
+    assert pressed >= 3
+    assert all(driven)
+
+
+@pytest.mark.parametrize("number", range(12))
+def test_it_takes_the_steps_of_random_arms_on_moving_bases(number, driven, rng):
+    seed = int(rng.integers(2**31))
+    compare(on_a_moving_base(random_scene(seed, number, steps=10).problem, rng), rng, 8, SAME)
+    serial = random_serial_scene(seed, number, steps=10)
+    if serial.arm_table.bodies != "hull":
+        compare(on_a_moving_base(serial, rng), rng, 8, SAME)
+
+
+@pytest.mark.parametrize("name", ["five_bay_two_cubes", "moving_base"])
+def test_most_steps_are_usual(name, driven):
+    maneuver = vq.solve(vq.load_problem(name))
     assert maneuver.certificate.ok
     assert len(driven) >= 20
     assert np.mean(driven) > 0.9
@@ -303,11 +365,15 @@ def test_a_direction_that_is_not_the_goals_is_refused(track, driven, monkeypatch
     assert not any(driven)
 
 
+@pytest.mark.parametrize(
+    "motion", [[], [{"time": 5.0, "position": [0.02, 0.01, 0.0]}]], ids=["rests", "moves"]
+)
 @pytest.mark.parametrize("lie", LIES)
-def test_a_state_that_is_not_what_it_is_said_to_be_is_refused(lie, driven, monkeypatch):
+def test_a_state_that_is_not_what_it_is_said_to_be_is_refused(lie, motion, driven, monkeypatch):
     name, change = LIES[lie]
     monkeypatch.setattr(fused, name, lying(getattr(fused, name), change))
-    resolver = vq.Resolver(vq.load_problem("five_bay_free").replace({"method.tracking_mode": "elastic"}))
+    changes = {"method.tracking_mode": "elastic", "truss.base_motion": motion}
+    resolver = vq.Resolver(vq.load_problem("five_bay_free").replace(changes))
     # At home nothing has to be settled.
     driven.clear()
     before = resolver.state

@@ -715,8 +715,8 @@ EXPORT int settle(Fused *f)
     return is_measured && f->errors[0] <= f->member && f->off <= f->tip ? DONE : UNSETTLED;
 }
 
-/* Follow the answer of the QP from q, and settle. */
-static int depart(Fused *f, double tolerance)
+/* Follow the answer of the QP from q, in which the base is where it is after the step, and settle. */
+static int depart(Fused *f, const double *q, double tolerance)
 {
     if (!(f->primal <= tolerance && f->dual <= tolerance)) return INACCURATE;
     double before = *f->progress, reached = fmin(fmax(before + f->x[f->unknowns - 1], 0.0), 1.0), fastest = 0.0;
@@ -725,7 +725,7 @@ static int depart(Fused *f, double tolerance)
     if ((1.0 - reached) * fastest <= f->left) reached = 1.0;
     f->reached = reached;
     *f->gone = reached - before;
-    memcpy(f->q, f->condense.arg[0], sizeof(double) * f->coordinates);
+    memcpy(f->q, q, sizeof(double) * f->coordinates);
     memcpy(f->points, f->condense.arg[3], sizeof(double) * 3 * f->vertices);
     memset(f->torsions, 0, sizeof(double) * f->torsion);
     advance(f, f->x, 1);
@@ -738,9 +738,9 @@ static int depart(Fused *f, double tolerance)
     return code;
 }
 
-/* Solve, follow the answer from q, and settle. */
+/* Solve, follow the answer from q, and settle; the base is at rest. */
 EXPORT int move(Fused *f, double tolerance)
 {
     int code = solve(f);
-    return code ? code : depart(f, tolerance);
+    return code ? code : depart(f, f->condense.arg[0], tolerance);
 }

@@ -55,6 +55,8 @@ typedef struct {
     /* The state, and the next one: q, nodes, (V, 3) control vertices, quantities, the last motion of q; of the next also
        the rates of the quantities over the duration, and the tip's position and rotation (3, 3), row by row. */
     double *q, *nodes, *vertices, *values, *motion;
+    int moves;                             /* whether the base moves; q and the nodes when it alone has moved */
+    double *based_q, *based_nodes;
     double *next_q, *next_nodes, *next_vertices, *next_values, *next_motion, *next_rates, *next_tip;
     double duration;
     double *points, *next_points;          /* (P, 3) those of the bodies; the nodes where they are the same */
@@ -128,6 +130,12 @@ static int clearance_row(StepData *s, int k)
     }
     double lower = (p->is_self ? s->self_safe : s->safe) + s->margin - contact[0], limited = fmin(lower, 2.0 * s->margin);
     f->near_lower[k] = s->corrects ? lower : fmax(limited, fmin(s->share_of_way * limited, -s->least_way));
+    /* Of the base's nodes the displacement is known; see ClearanceRows. */
+    for (int i = 0; i < s->slots && s->moves && !s->corrects; i++) {
+        if (f->node_column[nodes[i]] >= 0) continue;
+        for (int a = 0; a < 3; a++)
+            f->near_lower[k] -= rows[3 * i + a] * (s->based_nodes[3 * nodes[i] + a] - s->nodes[3 * nodes[i] + a]);
+    }
     return DONE;
 }
 
@@ -184,7 +192,7 @@ static int load(StepData *s)
     double **arg = (double **)f->condense.arg;
     memcpy(arg[0], s->q, sizeof(double) * f->coordinates);
     for (int i = 0; i < f->coordinates; i++) arg[1][i] = s->q[i] + 0.5 * s->share * s->motion[i];
-    memcpy(arg[2], s->nodes, sizeof(double) * s->width);
+    memcpy(arg[2], s->based_nodes, sizeof(double) * s->width);
     memcpy(arg[3], s->vertices, sizeof(double) * 3 * f->vertices);
     arg[6][0] = 1.0;
     arg[7][0] = 0.0;
@@ -212,7 +220,7 @@ static void look_ahead(StepData *s)
     }
     for (int a = 0; a < 3; a++) asked = fmax(asked, fabs(f->velocity[a]));
     s->reach = s->influence;
-    if (s->share >= 1.0) s->reach = s->motion_margin * (last == 0.0 ? s->influence : fmax(last, asked));
+    if (s->share >= 1.0) s->reach = s->motion_margin * (s->moves || last == 0.0 ? s->influence : fmax(last, asked));
     set_limits(s);
 }
 
@@ -320,7 +328,7 @@ static int is_flawless(StepData *s)
     const double *x = s->next_nodes, *ends = s->next_points, *lower = f->condense.arg[4], *upper = f->condense.arg[5];
     double rounding = s->relative * norm(f->q, f->coordinates), beyond = 0.0, wrong = 0.0, off = 0.0;
     for (int i = 0; i < s->based; i++)
-        if (f->q[s->base[i]] != s->q[s->base[i]]) return 0;
+        if (f->q[s->base[i]] != s->based_q[s->base[i]]) return 0;
     for (int m = 0, k = 0; m < s->quantities; m++) {
         double value = s->distances ? sqrt(square_of(ends + 3 * s->first[m], ends + 3 * s->last[m]))
                                     : f->q[s->first[m]] - s->multiplier[m] * f->q[s->last[m]];
@@ -528,7 +536,7 @@ static int proceed(StepData *s, double *mark)
     int code = answer(f);
     if (!code && s->asks && !f->other && ask_for(s, 0)) code = ASKS;
     else if (!code) {
-        code = depart(f, s->tolerance);
+        code = depart(f, s->corrects ? f->condense.arg[0] : s->based_q, s->tolerance);
         s->settled = !code;
         if (code == UNSETTLED && leaps(s, f->started, f->started_points)) code = FLAWED;
     }

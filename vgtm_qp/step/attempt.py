@@ -248,8 +248,9 @@ class Attempt:
             expected = MOTION_MARGIN * furthest
         rows = self.separation.rows(q, state.time, target.duration, reach, short, gain, expected=expected)
         if target.base is not None:
-            # The displacement of the nodes by the base is known.
-            rows = rows.after(arm.nodes(arm.based(q, target.base)) - arm.nodes(q))
+            # The displacement of its own nodes is known; the QP knows what it does to the others.
+            moved = arm.nodes(arm.based(q, target.base)) - arm.nodes(q)
+            rows = rows.after(np.where(arm.base[:, None], moved, 0.0))
         curve = state.control_vertices, state.torsion
         return QPInput(q, q + 0.5 * guess, *curve, target, goal, progress, rows, True), reach
 

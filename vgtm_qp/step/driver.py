@@ -1,8 +1,8 @@
 """The usual step in one call of C: from a state and its target to the next state and the proof of the way there.
 
 It takes the same step as an attempt of :mod:`vgtm_qp.step.attempt`, in a third of the time. What is unusual it leaves
-to that: pairs that are too near already, obstacles that move, meshes and hulls, angles, a moving base, a path that
-bends within the step, rows at places between two states. Each further QP is one more call. See ``native/step.c``.
+to that: pairs that are too near already, obstacles that move, meshes and hulls, angles, a path that bends
+within the step, rows at places between two states. Each further QP is one more call. See ``native/step.c``.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from vgtm_qp.step.separation import MOST_PIECES, Separation
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import State
 from vgtm_qp.step.step import WHOLE
-from vgtm_qp.step.target import QPInput, Target
+from vgtm_qp.step.target import QPInput, Target, base_frame
 
 MOTION_MARGIN = 2.5
 """Ratio of the displacement for which pairs are listed to the expected displacement of a node."""
@@ -128,7 +128,7 @@ Taken = Passage | Begun | Lost | Denied
 def can_drive(setup: Setup) -> bool:
     """Return whether usual steps of an arm can be taken in one call, if its ``Arm.arithmetic`` is known."""
     layout = setup.layout
-    is_plain = layout.general is None and layout.own is None and setup.base_motion is None
+    is_plain = layout.general is None and layout.own is None
     without_limits = setup.minimum_angle == 0.0 and setup.step_limit == np.inf
     return is_plain and without_limits
 
@@ -156,6 +156,7 @@ class Driver:
         self._held: State | None = None
         self._watch: Watch | None = None
         self.spent = np.zeros(len(PHASES))
+        self._moves = setup.base_motion is not None
         self._started = self._is_placed = False
 
     def take(self, state: State, target: Target, share: float) -> Taken | None:
@@ -168,6 +169,7 @@ class Driver:
             self._known is None
             or not work.is_ready
             or setup.carrier.carried
+            or self._moves != (target.base is not None)
             or not target.path.is_straight(target.start, target.end)
         ):
             return None
@@ -276,8 +278,18 @@ class Driver:
             for part, values in zip(self._parts, arrays, strict=False):
                 self._before[part] = values.reshape(-1)
             self._held = state
+        if target.base is not None:
+            self._move_base(state, target.base)
         data.duration, data.share = target.duration, share
         data.safe, data.self_safe = monitor.safe, monitor.self_safe
+
+    def _move_base(self, state: State, pose: Pose) -> None:
+        """Write where the base is at the end of the step."""
+        arm = self._setup.arm
+        based = arm.based(state.q, pose)
+        self._based_q[:], self._based_nodes[:] = based.reshape(-1), arm.nodes(based).reshape(-1)
+        if len(self._layout.tracked):
+            self._base_normal[:] = base_frame(arm, pose)[:, 2]
 
     def _passage(self, state: State, target: Target) -> Passage | None:
         """Return the step that the call took; None where what it did not check itself does not hold."""
@@ -288,7 +300,7 @@ class Driver:
         q, nodes = q.reshape(work.shape), nodes.reshape(-1, 3)
         vertices, progress, gap = vertices.reshape(-1, 3), work.data.reached, data.gap
         if layout.hard_turns:
-            gap = self._setup.gap(q, vertices, state.torsion, None)
+            gap = self._setup.gap(q, vertices, state.torsion, target.base)
             if layout.hard_tracking and not gap <= self._accuracy.tracking:
                 return None
         time, late = state.after(target.duration)
@@ -379,6 +391,12 @@ class Driver:
                 program.set(**{name: self._before[part]})
             program.set(**{f"next_{name}": self._after[part]})
         self._nodes = self._before[self._parts[1]].reshape(-1, 3)
+        self._based_q, self._based_nodes = (self._before[part] for part in self._parts[:2])
+        if self._moves:
+            self._based_q, self._based_nodes = self._based_q.copy(), self._based_nodes.copy()
+        self._base_normal = np.zeros(3)
+        if len(layout.tracked):
+            self._base_normal[:] = base_frame(arm, None)[:, 2]
         self._make_room(_ROOM)
         known, tip = self._known, arm.end_effector
         assert known is not None
@@ -404,6 +422,10 @@ class Driver:
             quantities=len(arm.quantity_names),
             based=len(known.based),
             base=known.based.astype(np.int32),
+            moves=int(self._moves),
+            based_q=self._based_q,
+            based_nodes=self._based_nodes,
+            base_normal=self._base_normal,
             distances=int(known.distances),
             first=known.first.astype(np.int32),
             last=known.last.astype(np.int32),
@@ -461,7 +483,6 @@ def _of_curve(layout: Layout) -> dict[str, object]:
         "ends_along_tip": int(layout.ends_along_tip),
         "must_track": int(layout.hard_tracking and not layout.hard_turns),
         "end_gain": np.ascontiguousarray(layout.end_gain),
-        "base_normal": np.ascontiguousarray(layout.arm.stations.frames[0][:, 2]),
     }
 
 
