@@ -248,9 +248,89 @@ def test_it_takes_the_steps_of_random_arms_on_moving_bases(number, driven, rng):
         compare(on_a_moving_base(serial, rng), rng, 8, SAME)
 
 
+def among_moving_obstacles(problem: vq.Problem, rng: np.random.Generator) -> vq.Problem:
+    """The problem with obstacles that move, each on its own way."""
+    setup = vq.Resolver(problem).setup
+    size = 0.03 * setup.arm.unit / setup.dt
+    moving = [
+        {**table, "velocity": (size * rng.normal(size=3)).tolist()} for table in problem.to_dict()["obstacle"]
+    ]
+    return problem.replace({"obstacle": moving})
+
+
+@pytest.mark.parametrize("name", ["five_bay_two_cubes", "snake_past_a_cube", "twelve_joints_past_a_crate"])
+def test_it_takes_the_steps_of_arms_among_moving_obstacles(name, driven, rng):
+    compare(among_moving_obstacles(vq.load_problem(name), rng), rng, 10, SAME)
+    assert any(driven)
+
+
+@pytest.mark.parametrize("number", range(12))
+def test_it_takes_the_steps_of_random_arms_among_moving_obstacles(number, driven, rng):
+    seed = int(rng.integers(2**31))
+    compare(among_moving_obstacles(random_scene(seed, number, steps=10).problem, rng), rng, 8, SAME)
+    serial = random_serial_scene(seed, number, steps=10)
+    if serial.arm_table.bodies != "hull":
+        compare(on_a_moving_base(among_moving_obstacles(serial, rng), rng), rng, 8, SAME)
+
+
+@pytest.mark.parametrize("name", ["five_bay_free", "snake_past_a_cube", "twelve_joints_past_a_crate"])
+@pytest.mark.parametrize("distance", ["fcl", "exact"])
+def test_an_arm_gives_way_to_a_ball_that_pushes_it(name, distance, driven):
+    problem = vq.load_problem(name).replace({"clearance.distance": distance})
+    setup = vq.Resolver(problem).setup
+    ends = setup.arm.bodies.some(setup.arm.home)[len(setup.arm.bodies) // 2]
+    middle, aside = ends.mean(axis=0), np.cross(ends[1] - ends[0], [0.0, -1.0, 0.0])
+    aside *= np.copysign(1.0 / np.linalg.norm(aside), middle[0] * aside[0])
+    way = setup.arm.bodies.radius[0] + setup.safe + 0.005 + 0.1
+    ball = {"name": "ball", "shape": "sphere", "radius": 0.1, "center": (middle + way * aside).tolist()}
+    ball["velocity"] = (-0.01 * setup.arm.unit / setup.dt * aside).tolist()
+    problem = problem.replace({"obstacle": [ball]})
+    one, other = vq.Resolver(problem), without(problem)
+    pressed, goal = 0, one.tip()[0]
+    driven.clear()
+    for _ in range(12):
+        other.state = one.state
+        found, expected = one.step(position=goal), other.step(position=goal)
+        assert found.moved
+        if found.qps == expected.qps == 1:
+            assert_same(found, expected, SAME)
+        asked = found.fcl_rows, found.exact_rows
+        assert not asked[distance == "fcl"]
+        pressed += any(active.startswith("clearance") for active in found.blocked_by)
+    assert pressed >= 3
+    assert np.mean(driven) > 0.8
+
+
+@pytest.mark.parametrize("until", ["through", "into"])
+@pytest.mark.parametrize("name", ["five_bay_free", "snake_past_a_cube"])
+def test_an_obstacle_that_comes_into_the_arm_between_two_states_stops_it(name, until, driven):
+    problem = vq.load_problem(name)
+    setup = vq.Resolver(problem).setup
+    middle = setup.arm.bodies.some(setup.arm.home)[len(setup.arm.bodies) // 2].mean(axis=0)
+    far = 4.0 * setup.arm.height * np.array([0.0, 1.0, 0.0])
+    steps = 2.5 if until == "through" else 3.0
+    bullet = {"name": "bullet", "shape": "sphere", "radius": 0.8, "center": (middle + steps * far).tolist()}
+    bullet["velocity"] = (-far / setup.dt).tolist()
+    resolver = vq.Resolver(problem.replace({"obstacle": [bullet]}))
+    goal = resolver.tip()[0]
+    driven.clear()
+    for _ in range(2):
+        assert resolver.step(position=goal).status is vq.StepStatus.REACHED
+    assert all(driven)
+    driven.clear()
+    before = resolver.state
+    assert not resolver.step(position=goal).moved
+    assert resolver.state is before
+    assert driven
+    assert not any(driven)
+
+
 @pytest.mark.parametrize("name", ["five_bay_two_cubes", "moving_base"])
-def test_most_steps_are_usual(name, driven):
-    maneuver = vq.solve(vq.load_problem(name))
+@pytest.mark.parametrize("velocity", [[0.0, 0.0, 0.0], [0.01, 0.005, -0.01]], ids=["rest", "move"])
+def test_most_steps_are_usual(name, velocity, driven):
+    problem = vq.load_problem(name)
+    obstacles = [{**table, "velocity": velocity} for table in problem.to_dict()["obstacle"]]
+    maneuver = vq.solve(problem.replace({"obstacle": obstacles}))
     assert maneuver.certificate.ok
     assert len(driven) >= 20
     assert np.mean(driven) > 0.9

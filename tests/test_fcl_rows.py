@@ -181,8 +181,8 @@ def lie_always(monkeypatch, lie, monitor=None, X=None):
         lie(found, monitor, X)
         return found
 
-    def answer(self, question, piece, written):
-        one(self, question, piece, written)
+    def answer(self, question, piece, time, written):
+        one(self, question, piece, time, written)
         found = written[None] / self.scale
         lie(found, monitor, X)
         written[:] = self.scale * found[0]
@@ -353,8 +353,11 @@ def test_between_cylinders_the_states_are_those_of_closed_forms_to_what_fcl_leav
 
 
 @pytest.mark.parametrize("untruth", [lie for lie in LIES if lie not in (other_pair, not_the_nearest)])
-def test_every_row_that_presses_is_proven_and_lies_change_no_step(untruth, problem, monkeypatch):
+@pytest.mark.parametrize("velocity", [[0.0, 0.0, 0.0], [-0.01, 0.0, 0.005]], ids=["rests", "moves"])
+def test_every_row_that_presses_is_proven_and_lies_change_no_step(untruth, velocity, problem, monkeypatch):
     pressed = 0
+    tables = [{**table, "velocity": velocity} for table in problem.to_dict()["obstacle"]]
+    problem = problem.replace({"obstacle": tables})
     goal = np.array([0.9, 0.0, 3.6])
     honest, lied, exact = (
         vq.Resolver(problem.replace({"clearance.distance": name})) for name in ("fcl", "fcl", "exact")

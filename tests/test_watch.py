@@ -22,8 +22,8 @@ MEMBERS = [(0, 1), (1, 2), (2, 3), (3, 4), (4, 5), (0, 2), (1, 4)]
 FORWARD = np.array([1.0, 0.0, 0.0])
 
 
-def scene(rng, *, round_numbers=False, watch=True):
-    """Nodes, and a monitor of their members among a box, a ball and a post at rest."""
+def scene(rng, *, round_numbers=False, watch=True, fastest=0.0):
+    """Nodes, and a monitor of their members among a box, a ball and a post, whose speeds are up to `fastest`."""
 
     def vector(bound):
         v = rng.uniform(-bound, bound, 3)
@@ -34,10 +34,14 @@ def scene(rng, *, round_numbers=False, watch=True):
             np.eye(3) if round_numbers else Rotation.random(random_state=int(rng.integers(2**31))).as_matrix()
         )
 
+    def velocity():
+        way = rng.normal(size=3)
+        return rng.uniform(0.0, fastest) * way / np.linalg.norm(way) if fastest else np.zeros(3)
+
     obstacles = [
-        box("box", vector(2.0), rng.choice([0.25, 0.5, 0.75], 3), turn()),
-        sphere("ball", vector(2.0), 0.25),
-        cylinder("post", vector(2.0), 0.25, 1.0, turn()),
+        box("box", vector(2.0), rng.choice([0.25, 0.5, 0.75], 3), turn(), velocity()),
+        sphere("ball", vector(2.0), 0.25, velocity()),
+        cylinder("post", vector(2.0), 0.25, 1.0, turn(), velocity()),
     ]
     nodes = np.array([vector(1.5) for _ in range(6)])
     return nodes, Clearance(capsules(MEMBERS, 0.03), obstacles, safe=0.08, influence=0.5, watch=watch)
@@ -65,21 +69,22 @@ def nearest_by_name(found):
     return nearest
 
 
-@pytest.mark.parametrize("round_numbers", [False, True])
-def test_every_pair_nearer_than_the_limits_is_there_in_every_state(round_numbers, rng):
+@pytest.mark.parametrize(("round_numbers", "fastest"), [(False, 0.0), (True, 0.0), (False, 0.4), (True, 0.4)])
+def test_every_pair_nearer_than_the_limits_is_there_in_every_state(round_numbers, fastest, rng):
     compared = 0
     for _ in range(8):
-        X, monitor = scene(rng, round_numbers=round_numbers)
-        watch = watch_of(monitor)
+        X, monitor = scene(rng, round_numbers=round_numbers, fastest=fastest)
+        watch, time = watch_of(monitor), rng.uniform(-3.0, 3.0)
         for state in walk(X, rng, 25, 0.06):
+            time += rng.uniform(-0.1, 0.3)
             limits = {False: rng.uniform(0.2, 0.5), True: rng.uniform(0.1, 0.3)}
-            every = brute_force(monitor, state, 0.0).items()
+            every = brute_force(monitor, state, time).items()
             wanted = {
                 monitor.names.clearance(Pair(*pair)): distance
                 for pair, distance in every
                 if distance < limits[pair[2]]
             }
-            found = watch.near(state, limits[False], limits[True])
+            found = watch.near(state, time, limits[False], limits[True])
             if found is None:
                 assert min(wanted.values()) <= 0.0
                 continue
@@ -90,25 +95,44 @@ def test_every_pair_nearer_than_the_limits_is_there_in_every_state(round_numbers
     assert compared >= 20
 
 
-def test_what_is_proven_on_the_way_holds_at_every_instant(rng):
+@pytest.mark.parametrize("fastest", [0.0, 0.3])
+def test_what_is_proven_on_the_way_holds_at_every_instant(fastest, rng):
     proven = 0
     for _ in range(10):
-        X, monitor = scene(rng)
-        watch = watch_of(monitor)
+        X, monitor = scene(rng, fastest=fastest)
+        watch, since = watch_of(monitor), rng.uniform(-2.0, 2.0)
         for start, end in pairwise(walk(X, rng, 12, 0.05)):
-            here = brute_force(monitor, start, 0.0).items()
+            until = since + rng.uniform(0.0, 0.4)
+            here = brute_force(monitor, start, since).items()
             floors = [
                 max(0.0, 0.9 * min(distance for pair, distance in here if pair[2] is is_self))
                 for is_self in (False, True)
             ]
-            watch.near(start, floors[0] + 0.2, floors[1] + 0.2)
-            if not watch.follow(np.stack([start, end]), *floors):
-                continue
-            proven += 1
-            for s in np.linspace(0.0, 1.0, 11):
-                for pair, distance in brute_force(monitor, start + s * (end - start), 0.0).items():
+            watch.near(start, since, floors[0] + 0.2, floors[1] + 0.2)
+            middle = start + 0.5 * (end - start)
+            is_proven = watch.follow(np.stack([start, middle, end]), since, until, *floors)
+            for s in np.linspace(0.0, 1.0, 11) if is_proven else ():
+                at, time = start + s * (end - start), since + s * (until - since)
+                for pair, distance in brute_force(monitor, at, time).items():
                     assert distance >= floors[pair[2]] - 1e-12
+            proven, since = proven + is_proven, until
     assert proven >= 5
+
+
+def test_an_obstacle_that_comes_through_a_body_at_rest_is_not_proven():
+    ball = sphere("ball", [1.0, 0.0, 0.5], 0.1, [-1.0, 0.0, 0.0])
+    monitor = Clearance(capsules([(0, 1), (2, 3)], 0.03), [ball], safe=0.08, influence=0.5)
+    X = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 9.0, 0.0], [0.0, 9.0, 1.0]])
+    watch = watch_of(monitor)
+    assert watch.follow(np.stack([X, X]), 0.0, 0.7, 0.08, 0.0)
+    assert watch.keeps(X, 0.7, 0.08, 0.0)
+    # What holds at one time says nothing of another.
+    assert not watch.keeps(X, 0.9, 0.08, 0.0)
+    assert not watch.follow(np.stack([X, X]), 0.0, 0.9, 0.08, 0.0)
+    # Before and after all is clear.
+    assert not watch.follow(np.stack([X, X]), 0.0, 2.0, 0.08, 0.0)
+    assert watch.follow(np.stack([X, X - 2.0 * FORWARD]), 0.0, 2.0, 0.08, 0.0)
+    assert watch.follow(np.stack([X, X]), 2.0, 3.0, 0.08, 0.0)
 
 
 @pytest.mark.smoke
@@ -117,26 +141,27 @@ def test_a_way_into_an_obstacle_is_not_proven():
     monitor = Clearance(capsules([(0, 1)], 0.03), [wall], safe=0.08, influence=0.5, self_collision=False)
     start = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     watch = watch_of(monitor)
-    assert watch.follow(np.stack([start, start + 0.1 * FORWARD]), 0.08, 0.0)
-    assert not watch.follow(np.stack([start, start + 0.9 * FORWARD]), 0.08, 0.0)
+    assert watch.follow(np.stack([start, start + 0.1 * FORWARD]), 0.0, 0.0, 0.08, 0.0)
+    assert not watch.follow(np.stack([start, start + 0.9 * FORWARD]), 0.0, 0.0, 0.08, 0.0)
     # Through the wall to where all is clear again: only the way tells.
-    assert not watch.follow(np.stack([start, start + 2.0 * FORWARD]), 0.08, 0.0)
-    assert watch.follow(np.stack([start, start - 0.5 * FORWARD]), 0.08, 0.0)
+    assert not watch.follow(np.stack([start, start + 2.0 * FORWARD]), 0.0, 0.0, 0.08, 0.0)
+    assert watch.follow(np.stack([start, start - 0.5 * FORWARD]), 0.0, 0.0, 0.08, 0.0)
     for number in (np.nan, np.inf):
         with pytest.raises(GeometryError, match="finite"):
-            watch.follow(np.stack([start, np.full((2, 3), number)]), 0.08, 0.0)
-    assert watch.follow(np.stack([start, start + 0.1 * FORWARD]), 0.08, 0.0)
-    assert not watch.follow(np.stack([start, start + 0.9 * FORWARD]), 0.08, 0.0)
+            watch.follow(np.stack([start, np.full((2, 3), number)]), 0.0, 0.0, 0.08, 0.0)
+    assert watch.follow(np.stack([start, start + 0.1 * FORWARD]), 0.0, 0.0, 0.08, 0.0)
+    assert not watch.follow(np.stack([start, start + 0.9 * FORWARD]), 0.0, 0.0, 0.08, 0.0)
 
 
-def test_a_way_from_a_state_that_was_left_is_bound_from_there(rng):
-    X, monitor = scene(rng)
+@pytest.mark.parametrize("fastest", [0.0, 0.5])
+def test_a_way_from_a_state_that_was_left_is_bound_from_there(fastest, rng):
+    X, monitor = scene(rng, fastest=fastest)
     watch, fresh = watch_of(monitor), watch_of(monitor)
     states = walk(X, rng, 10, 0.1)
-    for state in states:
-        watch.near(state, 0.4, 0.3)
-    for state in states:
-        found, wanted = watch.near(state, 0.4, 0.3), fresh.near(state, 0.4, 0.3)
+    for k, state in enumerate(states):
+        watch.near(state, 0.1 * k, 0.4, 0.3)
+    for k, state in enumerate(states):
+        found, wanted = watch.near(state, 0.1 * k, 0.4, 0.3), fresh.near(state, 0.1 * k, 0.4, 0.3)
         assert (found is None) == (wanted is None)
         if found is not None:
             np.testing.assert_allclose(np.sort(found.distance), np.sort(wanted.distance), atol=1e-12)
@@ -154,7 +179,7 @@ def test_scenes_that_are_watched():
     assert watched(ball)
     assert watched()
     assert not watched(wedge)
-    assert not watched(sphere("ball", [5.0, 0.0, 0.0], 0.2, [0.1, 0.0, 0.0]))
+    assert watched(sphere("ball", [5.0, 0.0, 0.0], 0.2, [0.1, 0.0, 0.0]))
     assert not watched(self_collision=False)
     assert watched(members=[(k, k + 1) for k in range(200)])
     assert not watched(members=[(k, k + 1) for k in range(201)])
@@ -172,16 +197,17 @@ def compare(first, second, X, **reach):
     return len(names[0])
 
 
-def test_contacts_are_the_same_whichever_way_they_are_found(rng):
+@pytest.mark.parametrize("fastest", [0.0, 0.3])
+def test_contacts_are_the_same_whichever_way_they_are_found(fastest, rng):
     """By the watch and from the lists, at positions that are overwritten in place."""
     compared = 0
     for _ in range(6):
-        X, watched = scene(rng)
+        X, watched = scene(rng, fastest=fastest)
         listed = Clearance(capsules(MEMBERS, 0.03), watched.obstacles, safe=0.08, influence=0.5, watch=False)
         Y = X.copy()
-        for state in walk(X, rng, 12, 0.05):
+        for k, state in enumerate(walk(X, rng, 12, 0.05)):
             Y[:] = state
-            compared += compare(watched, listed, Y, self_reach=0.3, by_fcl=True)
+            compared += compare(watched, listed, Y, time=0.2 * k, self_reach=0.3, by_fcl=True)
     assert compared > 20
 
 
@@ -218,12 +244,12 @@ def test_a_pair_whose_centres_coincide_at_first_is_watched_like_every_other():
     monitor = Clearance(capsules(members, 0.03), [ball], safe=0.08, influence=0.5)
     X = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [-0.5, 0.0, 0.5], [0.5, 0.0, 0.5]])
     watch = watch_of(monitor)
-    assert watch.near(X, 0.3, 0.3) is None
+    assert watch.near(X, 0.0, 0.3, 0.3) is None
     clear = X + np.array([[0.0, 0.5, 0.0]] * 2 + [[0.0, -0.5, 0.0]] * 2)
-    watch.near(clear, 0.6, 1.2)
-    found = watch.near(clear, 0.6, 1.2)
+    watch.near(clear, 0.0, 0.6, 1.2)
+    found = watch.near(clear, 0.0, 0.6, 1.2)
     assert sorted(found.is_self.tolist()) == [False, False, True]
-    assert not watch.follow(np.stack([clear, X]), 0.08, 0.02)
+    assert not watch.follow(np.stack([clear, X]), 0.0, 0.0, 0.08, 0.02)
     assert len(every_pair(monitor.scene, X)[0]) == 2
 
 
@@ -231,10 +257,10 @@ def test_members_that_all_meet_at_one_node_have_nothing_to_watch():
     monitor = Clearance(capsules([(0, 3), (1, 3), (2, 3)], 0.03), [], safe=0.08, influence=0.5)
     X = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     watch = watch_of(monitor)
-    assert not len(watch.near(X, 0.5, 0.5).distance)
-    assert watch.follow(np.stack([X, X + 0.1 * FORWARD]), 0.08, 0.02)
+    assert not len(watch.near(X, 0.0, 0.5, 0.5).distance)
+    assert watch.follow(np.stack([X, X + 0.1 * FORWARD]), 0.0, 0.0, 0.08, 0.02)
     with pytest.raises(GeometryError):
-        watch.follow(np.stack([X, np.full(X.shape, np.nan)]), 0.08, 0.02)
+        watch.follow(np.stack([X, np.full(X.shape, np.nan)]), 0.0, 0.0, 0.08, 0.02)
 
 
 @pytest.mark.parametrize("floor", [-0.05, -0.001, 0.0])
@@ -245,8 +271,8 @@ def test_floors_below_zero_are_those_of_surfaces_that_overlap_already(floor):
     )
     X = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 2.0]]) + 0.93 * FORWARD
     watch = watch_of(monitor)
-    assert not watch.follow(np.stack([X, X + 0.2 * FORWARD]), floor, floor)
-    assert watch.follow(X + np.array([[[-0.2]], [[-0.1]]]) * FORWARD, floor, floor)
+    assert not watch.follow(np.stack([X, X + 0.2 * FORWARD]), 0.0, 0.0, floor, floor)
+    assert watch.follow(X + np.array([[[-0.2]], [[-0.1]]]) * FORWARD, 0.0, 0.0, floor, floor)
 
 
 @pytest.mark.skipif(compiler() is None, reason="no C compiler")
@@ -286,10 +312,10 @@ def test_a_way_in_pieces_is_proven_where_each_piece_is(rng):
     angles = np.linspace(np.pi, 0.0, 13)
     stops = np.stack([1.0 + np.cos(angles), 1.6 * np.sin(angles), 0.0 * angles], axis=1)
     round_it, through = start + stops[:, None], start + stops[[0, 12, 6]][:, None]
-    for ask in (watch_of(monitor).follow, lambda *way: monitor.along(way[0], 0.0, 1.0, *way[1:]).certified):
-        assert ask(round_it, 0.08, 0.0)
-        assert not ask(through, 0.08, 0.0)
-        assert ask(round_it, 0.08, 0.0)
+    for ask in (watch_of(monitor).follow, lambda *way: monitor.along(*way).certified):
+        assert ask(round_it, 0.0, 1.0, 0.08, 0.0)
+        assert not ask(through, 0.0, 1.0, 0.08, 0.0)
+        assert ask(round_it, 0.0, 1.0, 0.08, 0.0)
     unwatched = Clearance(
         capsules([(0, 1)], 0.03), [wall], safe=0.08, influence=0.5, self_collision=False, watch=False
     )

@@ -237,24 +237,24 @@ class Candidates:
         return far, min(far_self, bending.horizon - motion[_BENDING].greatest)
 
 
-def every_pair(scene: Scene, X: Array) -> list[Group]:
-    """Return groups of all pairs of a scene, with their distances at `X` (P, 3) and time 0."""
-    groups = every_pair_with_pieces(scene, X)
+def every_pair(scene: Scene, X: Array, time: float = 0.0) -> list[Group]:
+    """Return groups of all pairs of a scene, with their distances at `X` (P, 3) and a `time`, s."""
+    groups = every_pair_with_pieces(scene, X, time)
     if scene.has_self:
         bodies = np.arange(len(scene.bodies))
         pairs = Group(scene, "segment", *_near_bodies(X, scene.bodies, bodies, FAR), place=_RIGID)
-        pairs.keep_near(X, 0.0, FAR)
+        pairs.keep_near(X, time, FAR)
         groups.append(pairs)
     return [group for group in groups if len(group)]
 
 
-def every_pair_with_pieces(scene: Scene, X: Array) -> list[Group]:
-    """Return groups of all pairs of a body and a piece, with their distances at `X` (P, 3) and time 0."""
+def every_pair_with_pieces(scene: Scene, X: Array, time: float) -> list[Group]:
+    """Return groups of all pairs of a body and a piece, with their distances at `X` (P, 3) and a `time`, s."""
     bodies, groups = np.arange(len(scene.bodies)), []
     for shape in np.unique(scene.pieces.shape).tolist() if len(scene.pieces) else []:
         pieces = np.flatnonzero(scene.pieces.shape == shape)
         group = Group(scene, shape, np.tile(bodies, len(pieces)), np.repeat(pieces, len(bodies)))
-        group.keep_near(X, 0.0, FAR)
+        group.keep_near(X, time, FAR)
         groups.append(group)
     return [group for group in groups if len(group)]
 

@@ -28,8 +28,7 @@ class Clearance:
     """Distances of an arm's bodies from obstacles and from each other; one thread at a time.
 
     Positions ``X`` (P, 3), m, are those of the points that ``Bodies.points`` indexes. Lists of pairs that may be near
-    are kept from one call to the next. Small scenes at rest are also watched, which is faster for the states of a
-    motion.
+    are kept from one call to the next. Small scenes are also watched, which is faster for the states of a motion.
 
     Parameters
     ----------
@@ -42,7 +41,7 @@ class Clearance:
     self_collision : bool
         Whether pairs of bodies that are not neighbours count.
     watch : bool
-        Whether small scenes at rest are watched; the answers are the same.
+        Whether small scenes are watched; the answers are the same.
     by_fcl : bool
         Whether :meth:`near` may use python-fcl for the contacts of capsules.
     unit : float
@@ -156,7 +155,7 @@ class Clearance:
         reach = self.influence if reach is None else reach
         self_reach = min(reach, self.self_influence) if self_reach is None else self_reach
         if tracked and (watch := self.watching()) is not None:
-            watched = watch.near(X, reach, self_reach, by_fcl=by_fcl, wanted=wanted)
+            watched = watch.near(X, time, reach, self_reach, by_fcl=by_fcl, wanted=wanted)
             if watched is not None:
                 return watched
         candidates = self._candidates
@@ -229,7 +228,8 @@ class Clearance:
             For obstacles and, if it differs, between bodies, m.
         """
         self_floor = floor if self_floor is None else self_floor
-        if self.is_watched and self._watching is not None and self._watching.keeps(X, floor, self_floor):
+        watch = self._watching if self.is_watched else None
+        if watch is not None and watch.keeps(X, time, floor, self_floor):
             return True
         motion = self._candidates.cover(X, time, max(floor, 0.0), max(self_floor, 0.0))
         for group in self._candidates.groups:
@@ -278,7 +278,7 @@ class Clearance:
         """
         self_floor = floor if self_floor is None else self_floor
         if not lowered and (watch := self.watching()) is not None:
-            proven = watch.follow(places, floor, self_floor)
+            proven = watch.follow(places, start_time, end_time, floor, self_floor)
             if proven or not thorough:
                 return BetweenReport(proven, min(floor, self_floor), np.zeros(0), self.scene.nothing)
         pieces, lowest = len(places) - 1, np.inf

@@ -152,7 +152,7 @@ def follow_function(shape: str) -> ca.Function:
     """Return the contacts of a pair after a straight motion, and a lower bound of its distance meanwhile.
 
     Inputs ``ends (24,)``: two of the body and two of the other body before the motion, then the same after
-    it; those of the other are ignored for an obstacle, which is at rest. And ``known (19,)``: the piece (15;
+    it; those of the other are ignored for an obstacle, in whose frame the ends are. And ``known (19,)``: the piece (15;
     ignored for two bodies), the radius or sum of radii, and a unit normal (3), preferably that of the contact
     before the motion.
 

@@ -98,17 +98,17 @@ class FclQueries:
             others = map(self._piece, pieces, repeat(time))
         return self._ask(bodies, others)
 
-    def answer(self, question: Array, piece: int | None, answer: Array) -> None:
+    def answer(self, question: Array, piece: int | None, time: float, answer: Array) -> None:
         """Write FCL's distance and nearest points (7) of one pair, all in FCL's units, to `answer`.
 
         The `question` (12) has middle and span of the body's axis, then those of the other body's, which only count
-        where `piece` is None. Pieces are at rest.
+        where `piece` is None. Pieces are where they are at a `time`, s.
         """
         body = self._body.placed(question[:3], question[3:6].tolist())
         other = (
             self._other.placed(question[6:9], question[9:].tolist())
             if piece is None
-            else self._piece(piece, 0.0)
+            else self._piece(piece, time)
         )
         # A value that FCL does not overwrite must not pass for an answer.
         self._result.min_distance = inf

@@ -1,10 +1,10 @@
-"""All pairs of a scene at rest, evaluated only when they may have come near.
+"""All pairs of a small scene, evaluated only when they may have come near.
 
 Each pair keeps a lower bound of its distance: its distance at the last evaluation, less a bound of the
 approach of its bodies since. A body's distance from an obstacle changes by no more than an end of the body
-moves. The distance of two bodies changes by no more than the relative displacement of their middles plus the
-turns of both about these. If the bound falls below the limit, the pair is evaluated, and its distance on the
-motion from the state before is bounded: ``pairs.c``.
+moves, and the obstacle. The distance of two bodies changes by no more than the relative displacement of their
+middles plus the turns of both about these. If the bound falls below the limit, the pair is evaluated, and its
+distance on the motion from the state before is bounded: ``pairs.c``.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ _NEXT = 2.0
 
 
 def can_be_watched(scene: Scene) -> bool:
-    """Return whether only the arm moves, there are no meshes and no hulls, and there are not too many pairs."""
+    """Return whether there are no meshes and no hulls, and not too many pairs."""
     bodies, pieces = len(scene.bodies), scene.pieces
-    simple = not (pieces.moving or scene.bodies.hulls) and "triangle" not in pieces.shape
+    simple = not scene.bodies.hulls and "triangle" not in pieces.shape
     count = bodies * len(pieces) + (bodies * (bodies - 1) // 2 if scene.has_self else 0)
     return simple and bodies > 1 and 0 < count <= _MOST_PAIRS
 
@@ -92,9 +92,9 @@ class WatchedGroup:
 
     def hold(self, group: Group) -> None:
         """Watch the pairs of `group`, of the same shape, in the place of those before."""
-        count = len(group)
+        count, pieces = len(group), group.scene.pieces
         self.group = group
-        piece = np.zeros((count, WIDTH)) if group.is_self else group.scene.pieces.parameters[group.other]
+        piece = np.zeros((count, WIDTH)) if group.is_self else pieces.parameters[group.other]
         normal = np.tile([0.0, 0.0, 1.0], (count, 1))
         self._lower = group.distance.copy()
         self._rows, self._contacts = np.zeros(count, dtype=np.int64), np.zeros((2 * count, CONTACT))
@@ -110,6 +110,8 @@ class WatchedGroup:
             known=np.concatenate([piece, group.radius[:, None], normal], axis=1),
             rows=self._rows,
             contacts=self._contacts,
+            velocity=pieces.velocity[group.other] if group.moving else 0,
+            speed=pieces.speed[group.other] if group.moving else 0,
         )
 
     def address(self) -> int:
@@ -121,19 +123,21 @@ class WatchedGroup:
         """Return whether no distance in the present state is below `floor`, m."""
         return bool(self._lower.min(initial=np.inf) >= floor)
 
-    def near(self, X: Array, limit: float, by_fcl: bool, wanted: Wanted | None) -> Found:
-        """Return the `wanted` contacts nearer than `limit`, m, in the present state `X`."""
+    def near(self, X: Array, time: float, limit: float, by_fcl: bool, wanted: Wanted | None) -> Found:
+        """Return the `wanted` contacts nearer than `limit`, m, in the present state, `X` at a `time`, s."""
         contacts = self._contacts[: 2 * self.data.near]
         near = (contacts[:, 0] < limit).nonzero()[0]
         rows, contacts = self._rows.take(near >> 1), contacts.take(near, axis=0)
         if wanted is not None:
             kept = self.group.chosen(wanted, rows, contacts)
             rows, contacts = rows[kept], contacts[kept]
-        return self.group.contacts(X, 0.0, rows, contacts, by_fcl)
+        return self.group.contacts(X, time, rows, contacts, by_fcl)
 
 
 class Watch:
     """Holds all pairs of a scene that :func:`can_be_watched`; one thread at a time.
+
+    States are positions of the points (P, 3), m, and times, s, at which pieces are where their motion leads.
 
     Attributes
     ----------
@@ -159,6 +163,7 @@ class Watch:
     def near(
         self,
         X: Array,
+        time: float,
         limit: float,
         self_limit: float,
         *,
@@ -167,53 +172,60 @@ class Watch:
     ) -> Contacts | None:
         """Return the contacts nearer than `limit`, or `self_limit` between bodies, m; None where surfaces overlap.
 
-        `X` (P, 3) are positions of the points; `by_fcl` says whether FCL supplies the contacts, `wanted`
-        which pairs have any.
+        `X` and `time` are the state; `by_fcl` says whether FCL supplies the contacts, `wanted` which pairs have any.
         """
-        way = self.move_to(X, limit, self_limit)
+        way = self.move_to(X, time, limit, self_limit)
         way.set(wanted=AHEAD * limit, self_wanted=AHEAD * self_limit)
         limits, near = (limit, self_limit), [pairs for pairs in self.groups if pairs.data.near]
         if any(pairs.data.overlaps for pairs in near):
             return None
         return self._scene.contacts(
-            [pairs.near(X, limits[pairs.group.is_self], by_fcl, wanted) for pairs in near]
+            [pairs.near(X, time, limits[pairs.group.is_self], by_fcl, wanted) for pairs in near]
         )
 
-    def keeps(self, X: Array, floor: float, self_floor: float) -> bool:
-        """Return whether `X` is the present state, and no surface distance there is below its floor, m."""
+    def keeps(self, X: Array, time: float, floor: float, self_floor: float) -> bool:
+        """Return whether `X` and `time` are the present state, with no surface distance below its floor, m."""
         floors = floor, self_floor
-        return self._is_at(X) and all(pairs.keeps(floors[pairs.group.is_self]) for pairs in self.groups)
+        return self._is_at(X, time) and all(pairs.keeps(floors[pairs.group.is_self]) for pairs in self.groups)
 
-    def follow(self, places: Array, floor: float, self_floor: float) -> bool:
+    def follow(
+        self, places: Array, start_time: float, end_time: float, floor: float, self_floor: float
+    ) -> bool:
         """Return whether no surface distance falls below its floor, m, on a path of straight pieces.
 
         False may also mean that this was not proven. The path leads from one of the `places` of the points
-        (K + 1, P, 3), m, to the next. The last place reached becomes the present state.
+        (K + 1, P, 3), m, to the next, in equal parts of the time. The last place reached becomes the present state.
         """
-        if not self._is_at(places[0]):
-            self._go(self._from_here(places[0]))
-        return self._go(places, floor, self_floor)
+        if not self._is_at(places[0], start_time):
+            self._go_to(places[0], start_time)
+        return self._go(places, start_time, end_time, floor, self_floor)
 
-    def move_to(self, X: Array, limit: float, self_limit: float) -> Program:
-        """Make `X` the present state, with all contacts nearer than the limits, m; return the ``Way`` of C."""
+    def move_to(self, X: Array, time: float, limit: float, self_limit: float) -> Program:
+        """Make `X` and `time` the present state, with all contacts nearer than the limits, m; return C's ``Way``."""
         way = self._way
-        if way is None or limit > way.data.reach or self_limit > way.data.self_reach or not self._is_at(X):
-            places = self._from_here(X)
-            self.started(X).set(wanted=limit, self_wanted=self_limit)
-            self._go(places)
-        return self.started(X)
+        is_here = way is not None and self._is_at(X, time)
+        if way is None or not is_here or limit > way.data.reach or self_limit > way.data.self_reach:
+            self.started(X, time).set(wanted=limit, self_wanted=self_limit)
+            self._go_to(X, time)
+        return self.started(X, time)
 
-    def _is_at(self, X: Array) -> bool:
-        """Return whether `X` (P, 3) are the positions of the present state."""
+    def _clock(self, time: float) -> float:
+        """Return the time that tells where pieces are: zero where they rest, else `time`, s."""
+        return time if self._scene.pieces.moving else 0.0
+
+    def _is_at(self, X: Array, time: float) -> bool:
+        """Return whether `X` (P, 3) and `time` are the present state."""
         way = self._way
-        is_known = way is not None and not way.data.lost and way.data.reach > -np.inf
-        return is_known and X.tobytes() == self._place.tobytes()
+        if way is None or way.data.lost or not way.data.reach > -np.inf:
+            return False
+        return bool(way.data.time == self._clock(time)) and X.tobytes() == self._place.tobytes()
 
-    def _from_here(self, X: Array) -> Array:
-        """Return (2, P, 3) the present place, `X` if there is none, and `X`."""
-        return np.stack([X if self._way is None or self._way.data.lost else self._place, X])
+    def _go_to(self, X: Array, time: float) -> None:
+        """Go from the present state, if there is one, to another."""
+        way = self.started(X, time)
+        self._go(np.stack([self._place, X]), way.data.time, time, -np.inf, -np.inf)
 
-    def _go(self, places: Array, floor: float = -np.inf, self_floor: float = -np.inf) -> bool:
+    def _go(self, places: Array, start_time: float, end_time: float, floor: float, self_floor: float) -> bool:
         """Go from place to place as long as the floors, m, are proven, and return whether all are.
 
         The last place reached becomes the present state. At the last of `places` the pairs that may be nearer
@@ -224,12 +236,14 @@ class Watch:
         GeometryError
             A position is not finite; the present state stays as it was.
         """
-        way = self.started(places[0])
+        way = self.started(places[0], start_time)
         places = np.ascontiguousarray(places)
         self.refresh()
         way.set(
             pieces=len(places) - 1,
             places=places,
+            start=self._clock(start_time),
+            end=self._clock(end_time),
             floor=floor,
             self_floor=self_floor,
             limit=max(way.data.wanted, floor),
@@ -247,16 +261,17 @@ class Watch:
         for k, pairs in enumerate(self.groups):
             self._pairs[k] = pairs.address()
 
-    def started(self, X: Array) -> Program:
-        """Return the ``Way`` of C; list the pairs that are not listed: all at `X`, or those with pieces."""
+    def started(self, X: Array, time: float) -> Program:
+        """Return the ``Way`` of C; list the pairs that are not listed: all in the state, or those with pieces."""
         if self._way is None or self._way.data.lost:
-            return self._start(X)
+            return self._start(X, time)
         if not self._is_whole:
-            self._hold([*map(self._watched, every_pair_with_pieces(self._scene, self._place)), *self.groups])
+            groups = every_pair_with_pieces(self._scene, self._place, self._way.data.time)
+            self._hold([*map(self._watched, groups), *self.groups])
         return self._way
 
-    def _start(self, X: Array) -> Program:
-        """List all pairs, with their distances at `X`."""
+    def _start(self, X: Array, time: float) -> Program:
+        """List all pairs, with their distances in the state."""
         bodies, self._way, self._place = self._scene.bodies, Program("Way"), X.copy()
         self._way.set(
             points=len(X),
@@ -267,9 +282,10 @@ class Watch:
             turned=np.zeros(len(bodies)),
             moved=np.zeros(len(bodies)),
             place=self._place,
+            time=self._clock(time),
             **dict.fromkeys(("reach", "self_reach", "wanted", "self_wanted"), -np.inf),
         )
-        self._hold(list(map(self._watched, every_pair(self._scene, X))))
+        self._hold(list(map(self._watched, every_pair(self._scene, X, self._clock(time)))))
         return self._way
 
     def _watched(self, group: Group) -> WatchedGroup:

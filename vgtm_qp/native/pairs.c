@@ -21,7 +21,8 @@ static double square_of(const double *before, const double *after)
 typedef struct {
     int count, is_self;
     const int *body, *other, *points;    /* (C), (C), (C, 4) */
-    double *lower, *known;               /* (C), (C, 19): see follow_function */
+    double *lower, *known;               /* (C), (C, 19): see follow_function; of a piece as it is at time 0 */
+    const double *velocity, *speed;      /* (C, 3), (C) of the pieces, m/s; null where none moves */
     double next;                         /* if no pair is near, pairs below next * limit are evaluated too */
 
     Kernel contact;                      /* (ends 24, known 19) -> 18 numbers of contacts, and a bound */
@@ -43,17 +44,19 @@ typedef struct {
     int pieces, points, bodies, groups;
     const int *ends;                 /* (B, 2) points */
     const double *places;            /* (K + 1, P, 3) */
+    double start, end;               /* times at both ends, s */
     double furthest;                 /* bound of the sum of the squares of displacements */
     Pairs **group;                   /* (G) */
     /* Distances to prove from pieces and between bodies, and those below which pairs are evaluated at the end. */
     double floor, self_floor, limit, self_limit;
 
-    double *place;                   /* (P, 3): the present one, where pairs nearer than the reach are evaluated */
+    double *place, time;             /* (P, 3), s: the present ones, where pairs nearer than the reach are evaluated */
     double reach, self_reach, wanted, self_wanted;    /* wanted: the reach of the next place */
     int lost;                        /* whether a pair had no value, so that nothing is known of any */
 
     double *middle, *turned, *moved; /* (B, 3), (B), (B): of each axis in the present piece the displacement
                                         of its middle, half that between its ends, the greater of its ends' */
+    double since, until;             /* times at both ends of that piece */
     int done;                        /* number of pieces that were followed */
 } Way;
 
@@ -75,13 +78,23 @@ static void displace(Way *w, const double *before, const double *after)
     }
 }
 
-/* Evaluate pair k over a straight motion, from the known normal at its start. */
-static int contact(Pairs *p, int k, const double *before, const double *after)
+/* Replace points by where they are at a time from the piece of pair k: in a frame that moves with that, and is the
+   world's at time 0. */
+static void from_piece(const Pairs *p, int k, double time, int points, double *x)
+{
+    if (!p->velocity) return;
+    for (int i = 0; i < 3 * points; i++) x[i] -= time * p->velocity[3 * k + i % 3];
+}
+
+/* Evaluate pair k over a straight motion between two times, from the known normal at its start. */
+static int contact(Pairs *p, int k, const double *before, const double *after, double since, double until)
 {
     for (int i = 0; i < 4; i++) {
         memcpy(p->ends + 3 * i, before + 3 * p->points[4 * k + i], 3 * sizeof(double));
         memcpy(p->ends + ENDS / 2 + 3 * i, after + 3 * p->points[4 * k + i], 3 * sizeof(double));
     }
+    from_piece(p, k, since, 4, p->ends);
+    from_piece(p, k, until, 4, p->ends + ENDS / 2);
     memcpy(p->pair, p->known + KNOWN * k, KNOWN * sizeof(double));
     if (call(&p->contact)) return NO_VALUE;
     memcpy(p->known + KNOWN * k + KNOWN_NORMAL, p->found + NORMAL, 3 * sizeof(double));
@@ -111,11 +124,11 @@ static void axis_of(const double *ends, double scale, double *axis)
     }
 }
 
-/* Replace the `contact` of pair k by an answer (7) about it, if that is proven: its flaw is no greater than `flaw`, and
-   the axes are further apart than `apart`. Return whether it is. */
-static int prove(Pairs *p, int k, const double *place, const double *answer, double flaw, double apart, double *contact)
+/* Replace the `contact` of pair k by an answer (7) about it at the present place and time, if that is proven: its flaw is
+   no greater than `flaw`, and the axes are further apart than `apart`. Return whether it is. */
+static int prove(const Way *w, Pairs *p, int k, const double *answer, double flaw, double apart, double *contact)
 {
-    const double *known = p->known + KNOWN * k;
+    const double *known = p->known + KNOWN * k, *place = w->place;
     double *pair = p->proof_pair, *radius = pair + (p->is_self ? 12 : KNOWN_NORMAL - 1 + 6);
     ends_for(p, k, place, contact, pair);
     if (p->is_self)
@@ -123,6 +136,8 @@ static int prove(Pairs *p, int k, const double *place, const double *answer, dou
     else memcpy(pair + 6, known, (KNOWN_NORMAL - 1) * sizeof(double));
     *radius = known[KNOWN_NORMAL - 1];
     memcpy(p->answer, answer, 7 * sizeof(double));
+    from_piece(p, k, w->time, 2, pair);
+    from_piece(p, k, w->time, 2, p->answer + 1);
     if (call(&p->proof)) return 0;
     /* NaN fails the comparisons. */
     if (!(p->proven[CONTACT - 1] <= flaw && p->proven[0] + *radius > apart)) return 0;
@@ -132,7 +147,7 @@ static int prove(Pairs *p, int k, const double *place, const double *answer, dou
     return 1;
 }
 
-/* Lower the bounds by what the bodies moved, and evaluate the pairs that may be nearer than the limit. If
+/* Lower the bounds by what bodies and pieces moved, and evaluate the pairs that may be nearer than the limit. If
    there are any, and none was near before, evaluate all that may be nearer than the reach. */
 static int evaluate(const Way *w, Pairs *p, double floor, double limit, double reach, const double *before,
                     const double *after)
@@ -145,6 +160,7 @@ static int evaluate(const Way *w, Pairs *p, double floor, double limit, double r
         double nearer = w->moved[a];
         if (p->is_self)
             nearer = sqrt(square_of(w->middle + 3 * a, w->middle + 3 * b)) + w->turned[a] + w->turned[b];
+        else if (p->velocity) nearer += p->speed[k] * fabs(w->until - w->since);
         p->lower[k] -= nearer;
         /* A negated comparison is true for NaN. */
         if (!(p->lower[k] >= limit)) is_known = 0;
@@ -154,10 +170,10 @@ static int evaluate(const Way *w, Pairs *p, double floor, double limit, double r
     if (is_known) return DONE;
     for (int k = 0; k < p->count; k++) {
         if (p->lower[k] >= reach) continue;
-        if (contact(p, k, before, after)) return NO_VALUE;
+        if (contact(p, k, before, after, w->since, w->until)) return NO_VALUE;
         /* The known normal may be of long ago: that at the start of this motion proves more. */
         if (p->found[CONTACTS] < floor && p->lower[k] < floor
-            && (contact(p, k, before, before) || contact(p, k, before, after)))
+            && (contact(p, k, before, before, w->since, w->since) || contact(p, k, before, after, w->since, w->until)))
             return NO_VALUE;
         memcpy(p->contacts + CONTACTS * p->near, p->found, CONTACTS * sizeof(double));
         /* The bound from the motion alone holds as well. */
@@ -181,9 +197,12 @@ EXPORT int follow(Way *w)
     for (int k = 0; k < w->pieces * step; k += 3) square += square_of(w->places + k, w->places + k + step);
     w->done = 0;
     if (!(square < w->furthest)) return TOO_FAR;
+    w->until = w->start;
     while (is_proven && w->done < w->pieces) {
         const double *before = w->places + w->done * step, *after = before + step;
         int is_last = ++w->done == w->pieces;
+        w->since = w->until;
+        w->until = is_last ? w->end : w->start + (double)w->done / w->pieces * (w->end - w->start);
         displace(w, before, after);
         for (int g = 0; g < w->groups; g++) {
             Pairs *pairs = w->group[g];
@@ -199,6 +218,7 @@ EXPORT int follow(Way *w)
         }
     }
     memcpy(w->place, w->places + w->done * step, sizeof(double) * step);
+    w->time = w->until;
     w->reach = w->done == w->pieces ? w->limit : w->floor;
     w->self_reach = w->done == w->pieces ? w->self_limit : w->self_floor;
     return is_proven ? DONE : NOT_PROVEN;

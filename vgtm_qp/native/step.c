@@ -55,6 +55,7 @@ typedef struct {
     /* The state, and the next one: q, nodes, (V, 3) control vertices, quantities, the last motion of q; of the next also
        the rates of the quantities over the duration, and the tip's position and rotation (3, 3), row by row. */
     double *q, *nodes, *vertices, *values, *motion;
+    double time, next_time, drift;         /* s; how far the fastest piece moves between them, m */
     int moves;                             /* whether the base moves; q and the nodes when it alone has moved */
     double *based_q, *based_nodes;
     double *next_q, *next_nodes, *next_vertices, *next_values, *next_motion, *next_rates, *next_tip;
@@ -70,9 +71,10 @@ typedef struct {
     int *group, *pair, *asked;
 
     /* Whether the QP corrects what one before it left, and whether the last answer was settled; the points (P, 3) and the
-       nodes (N, 3) where the QP is linearised. */
+       nodes (N, 3) where the QP is linearised, and the time. */
     int corrects, settled;
     const double *at, *nodes_at;
+    double at_time;
     double reach, limit, self_limit, gap;
     double *spent;                         /* (3) s in each phase so far: distance, QP, acceptance */
 } StepData;
@@ -128,8 +130,13 @@ static int clearance_row(StepData *s, int k)
         nodes[i] = point;
         memcpy(rows + 3 * i, part, sizeof(part));
     }
-    double lower = (p->is_self ? s->self_safe : s->safe) + s->margin - contact[0], limited = fmin(lower, 2.0 * s->margin);
-    f->near_lower[k] = s->corrects ? lower : fmax(limited, fmin(s->share_of_way * limited, -s->least_way));
+    double lower = (p->is_self ? s->self_safe : s->safe) + s->margin - contact[0];
+    if (!s->corrects) {
+        lower = fmin(lower, 2.0 * s->margin);
+        if (p->velocity) lower += s->duration * dot(normal, p->velocity + 3 * s->pair[k], 3);
+        lower = fmax(lower, fmin(s->share_of_way * lower, -s->least_way));
+    }
+    f->near_lower[k] = lower;
     /* Of the base's nodes the displacement is known; see ClearanceRows. */
     for (int i = 0; i < s->slots && s->moves && !s->corrects; i++) {
         if (f->node_column[nodes[i]] >= 0) continue;
@@ -139,10 +146,10 @@ static int clearance_row(StepData *s, int k)
     return DONE;
 }
 
-/* Whether the points of the way are at `place`. */
-static int is_at(const StepData *s, const double *place)
+/* Whether the points of the way are at `place`, at that time. */
+static int is_at(const StepData *s, const double *place, double time)
 {
-    return !memcmp(s->way->place, place, sizeof(double) * s->span);
+    return s->way->time == time && !memcmp(s->way->place, place, sizeof(double) * s->span);
 }
 
 /* The rows of all contacts nearer than the limits. */
@@ -154,7 +161,7 @@ static int list_rows(StepData *s)
     s->fused->near = s->round = s->asked_for = s->proven = 0;
     if (!w) return DONE;
     if (!(s->limit <= w->reach && s->self_limit <= w->self_reach)
-        || !is_at(s, s->at))
+        || !is_at(s, s->at, s->at_time))
         return ELSEWHERE;
     for (int g = 0; g < w->groups; g++) {
         const Pairs *p = w->group[g];
@@ -198,15 +205,16 @@ static int load(StepData *s)
     arg[7][0] = 0.0;
     s->corrects = 0;
     s->at = s->points;
+    s->at_time = s->time;
     s->nodes_at = s->nodes;
     return s->spread.eval ? spread_at(s, s->q, s->points) : DONE;
 }
 
 /* Set the distances below which pairs can become active where nodes move by the reach. */
-static void set_limits(StepData *s)
+static void set_limits(StepData *s, double drift)
 {
-    s->limit = fmin(s->influence, s->safe + s->reach);
-    s->self_limit = fmin(s->influence, s->self_safe + 2.0 * s->reach);
+    s->limit = fmin(s->influence, s->safe + s->reach + drift);
+    s->self_limit = fmin(s->influence, s->self_safe + 2.0 * (s->reach + drift));
 }
 
 /* The reach of the step, and the limits. */
@@ -221,7 +229,7 @@ static void look_ahead(StepData *s)
     for (int a = 0; a < 3; a++) asked = fmax(asked, fabs(f->velocity[a]));
     s->reach = s->influence;
     if (s->share >= 1.0) s->reach = s->motion_margin * (s->moves || last == 0.0 ? s->influence : fmax(last, asked));
-    set_limits(s);
+    set_limits(s, s->drift);
 }
 
 /* Ask for the contacts of all rows, or of those that press: whose multipliers are not zero. Those that were asked for
@@ -257,7 +265,7 @@ static int use_answers(StepData *s)
         double answer[7];
         for (int i = 0; i < 7; i++) answer[i] = s->answers[7 * k + i] / s->scale;
         Pairs *p = s->way->group[s->group[k]];
-        if (!prove(p, s->pair[k], s->at, answer, s->flaw, s->apart, s->contacts + CONTACT * k)) continue;
+        if (!prove(s->way, p, s->pair[k], answer, s->flaw, s->apart, s->contacts + CONTACT * k)) continue;
         s->proven++;
         if (clearance_row(s, k)) return NO_VALUE;
     }
@@ -421,14 +429,16 @@ static int is_clear(const StepData *s)
     return 1;
 }
 
-/* Lead the way straight to `place`, where the pairs that are wanted are evaluated. */
-static int lead_to(StepData *s, const double *place)
+/* Lead the way straight to `place` at a time, where the pairs that are wanted are evaluated. */
+static int lead_to(StepData *s, const double *place, double time)
 {
     Way *w = s->way;
     memcpy(s->places, w->place, sizeof(double) * s->span);
     memcpy(s->places + s->span, place, sizeof(double) * s->span);
     w->pieces = 1;
     w->places = s->places;
+    w->start = w->time;
+    w->end = time;
     w->floor = w->self_floor = -INFINITY;
     return advance_pairs(w);
 }
@@ -440,7 +450,7 @@ static int pass(StepData *s, int pieces, double spare)
     Way *w = s->way;
     int size = s->span;
     /* A try before this one may have led away. */
-    int code = is_at(s, s->points) ? DONE : lead_to(s, s->points);
+    int code = is_at(s, s->points, s->time) ? DONE : lead_to(s, s->points, s->time);
     if (code) return code;
     memcpy(s->places, s->points, sizeof(double) * size);
     for (int k = 1; k < pieces; k++) {
@@ -451,6 +461,8 @@ static int pass(StepData *s, int pieces, double spare)
     memcpy(s->places + pieces * size, s->next_points, sizeof(double) * size);
     w->pieces = pieces;
     w->places = s->places;
+    w->start = s->time;
+    w->end = s->next_time;
     w->floor = s->safe + spare;
     w->self_floor = fmax(s->self_safe + spare, 0.0);
     return advance_pairs(w);
@@ -459,7 +471,7 @@ static int pass(StepData *s, int pieces, double spare)
 /* Whether the next state, the way to which is proven or not, as `code` says, keeps all clearances itself. */
 static int judge(StepData *s, int code)
 {
-    if (code == NOT_PROVEN && !is_at(s, s->next_points) && lead_to(s, s->next_points)) return NOT_PROVEN;
+    if (code == NOT_PROVEN && !is_at(s, s->next_points, s->next_time) && lead_to(s, s->next_points, s->next_time)) return NOT_PROVEN;
     if (code && code != NOT_PROVEN) return code;
     return is_clear(s) ? code : TOO_NEAR;
 }
@@ -606,14 +618,15 @@ EXPORT int correct(StepData *s)
     arg[7][0] = f->reached;
     s->corrects = 1;
     s->at = s->next_points;
+    s->at_time = s->next_time;
     s->nodes_at = s->next_nodes;
     /* A pair that one correction pushed apart must stay listed for the next, or two corrections alternate. */
     s->reach = fmax(s->reach, f->furthest);
-    set_limits(s);
-    if (w && !(s->limit <= w->reach && s->self_limit <= w->self_reach && is_at(s, s->at))) {
+    set_limits(s, 0.0);
+    if (w && !(s->limit <= w->reach && s->self_limit <= w->self_reach && is_at(s, s->at, s->at_time))) {
         w->wanted = s->limit;
         w->self_wanted = s->self_limit;
-        int code = lead_to(s, s->at);
+        int code = lead_to(s, s->at, s->at_time);
         if (code) return code;
     }
     return solve_step(s, &mark);

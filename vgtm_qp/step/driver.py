@@ -1,8 +1,8 @@
 """The usual step in one call of C: from a state and its target to the next state and the proof of the way there.
 
 It takes the same step as an attempt of :mod:`vgtm_qp.step.attempt`, in a third of the time. What is unusual it leaves
-to that: pairs that are too near already, obstacles that move, meshes and hulls, angles, a path that bends
-within the step, rows at places between two states. Each further QP is one more call. See ``native/step.c``.
+to that: pairs that are too near already, meshes and hulls, angles, a path that bends within the step, rows at places
+between two states. Each further QP is one more call. See ``native/step.c``.
 """
 
 from __future__ import annotations
@@ -186,7 +186,8 @@ class Driver:
         if watch is None:
             data.way = 0
         else:
-            data.way = watch.started(state.nodes if self._points is None else self._points).address
+            at = state.nodes if self._points is None else self._points
+            data.way = watch.started(at, state.time).address
             watch.refresh()
         code = self._called(self._take)
         if not code:
@@ -194,7 +195,7 @@ class Driver:
         if code == Code.ELSEWHERE:
             assert watch is not None
             at = state.nodes if self._points is None else self._points
-            data.way = watch.move_to(at, data.limit, data.self_limit).address
+            data.way = watch.move_to(at, state.time, data.limit, data.self_limit).address
             code = self._called(self._take)
         if code == Code.DONE:
             return self._passage(state, target)
@@ -282,6 +283,11 @@ class Driver:
             self._move_base(state, target.base)
         data.duration, data.share = target.duration, share
         data.safe, data.self_safe = monitor.safe, monitor.self_safe
+        if (pieces := monitor.pieces).moving:
+            data.time, data.next_time = state.time, target.time
+            data.drift = pieces.fastest * target.duration
+        else:
+            data.time = data.next_time = data.drift = 0.0
 
     def _move_base(self, state: State, pose: Pose) -> None:
         """Write where the base is at the end of the step."""
@@ -335,7 +341,7 @@ class Driver:
         for k in asked.nonzero()[0].tolist():
             group = watch.groups[self._group[k]].group
             piece = None if group.is_self else int(group.other[self._pair[k]])
-            fcl.answer(self._questions[k], piece, self._answers[k])
+            fcl.answer(self._questions[k], piece, self._program.data.at_time, self._answers[k])
         self.spent[0] += perf_counter() - began
 
     def _rows(self) -> ClearanceRows:

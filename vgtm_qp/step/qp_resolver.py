@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from vgtm_qp.arrays import Array
@@ -67,21 +66,13 @@ class QPResolver(Resolver, serves="qp"):
         self._rehearse()
 
     def _rehearse(self) -> None:
-        """Try a step that stays at home: everything that steps make on first use is then there.
-
-        Where obstacles move, so is what the first scene at rest would make.
-        """
+        """Try a step that stays at home: everything that steps make on first use is then there."""
         if self.setup.elastic is not None:
             self.setup.elastic()
         state, path = self._state, self.setup.task.path_to(self.tip(), None, None, None)
         limits = self._actuation.limits(state, self.setup.dt, slowing=True)
         with suppress(VgtmError):
             self._attempt.run(state, self._shaping.target(state, self.setup.dt, path, 0.0, 1.0, limits[:2]))
-        if (monitor := self.setup.monitor).pieces.moving:
-            there = monitor.obstacles
-            self.setup.put([replace(obstacle, velocity=np.zeros(3)) for obstacle in there])
-            self._separation.shortfall(state.q, state.time, tracked=True)
-            self.setup.put(there)
         self._clock.seconds.update(dict.fromkeys(self._clock.seconds, 0.0))
 
     @property
