@@ -210,7 +210,7 @@ static int load(StepData *s)
     return s->spread.eval ? spread_at(s, s->q, s->points) : DONE;
 }
 
-/* Set the distances below which pairs can become active where nodes move by the reach. */
+/* Set the distances below which pairs can become active where nodes move by the reach, and pieces by the drift. */
 static void set_limits(StepData *s, double drift)
 {
     s->limit = fmin(s->influence, s->safe + s->reach + drift);
