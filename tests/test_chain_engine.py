@@ -170,6 +170,13 @@ def test_the_rows_of_a_period_are_derivatives(name, reverse, rng):
     np.testing.assert_allclose(np.einsum("kaf,kf->ka", turns, faces), change[2].reshape(-1, 2), atol=1e-8)
 
 
+def test_steps_that_close_parts_of_gaps_are_not_served():
+    """A chain's rows have whole gaps."""
+    layout, _ = make_layout(MODULES["octahedral"](), ("position",), vertices=7, hard_tracking=True)
+    assert ChainEngine.serves(chain_solver(layout))
+    assert not ChainEngine.serves(chain_solver(layout.giving_way()))
+
+
 @pytest.mark.parametrize("tracking", ["elastic", "hard"])
 def test_whole_maneuvers_are_the_same(tracking, monkeypatch):
     (scene,) = make_scenes(["cubes"], [24], [tracking])

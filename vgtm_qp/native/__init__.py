@@ -2,7 +2,7 @@
 
 The sources declare the structures that their functions take. :func:`structure` reads the fields from there, their only
 definition. ``pairs.c`` knows which bodies may have come near, ``working.c`` a QP whose working set is known, ``qp.c``
-the QP of a step, ``step.c`` the whole step.
+the QP of a step, ``chain.c`` that of a long arm, ``step.c`` the whole step.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _COMMENT = re.compile(r"/\*.*?\*/", re.DOTALL)
 _FUNCTION_POINTER = re.compile(r"\(\*(\w+)\)")
 
 _SOURCES = tuple(
-    Path(__file__).with_name(name) for name in ("base.h", "pairs.c", "working.c", "qp.c", "step.c")
+    Path(__file__).with_name(name) for name in ("base.h", "pairs.c", "working.c", "qp.c", "chain.c", "step.c")
 )
 
 INCLUDES = Path(ca.__file__).parent / "include"

@@ -1,4 +1,4 @@
-/* The beginning of our C: what follows it in one text are pairs.c, qp.c and step.c. */
+/* The beginning of our C: what follows it in one text are pairs.c, qp.c, chain.c and step.c. */
 
 #include <math.h>
 #include <string.h>

@@ -58,7 +58,7 @@ _SMALL_ERROR = 3e-6
 
 
 @cache
-def _daqp() -> dict[str, int]:
+def daqp_addresses() -> dict[str, int]:
     """Return the addresses of the functions of DAQP in CasADi's wheel, whose headers ``qp.c`` includes.
 
     There are none where the wheel has DAQP in no library of its own.
@@ -262,7 +262,7 @@ class FusedWorkspace:
                 for kernel in self.kernels:
                     kernel.prepare()
                 return False
-            self._is_ready = self._library.library is not None and bool(_daqp())
+            self._is_ready = self._library.library is not None and bool(daqp_addresses())
             if self._is_ready:
                 self._start()
         return self._is_ready
@@ -409,7 +409,7 @@ class FusedWorkspace:
         sums = 16 * (self.actuators + 1)
         work = nodes + sums + size * (rows + SETTLING_STEPS + 2)
         self._program = Program("Fused")
-        self._program.set(**_numbers(layout), **_daqp(), unknowns=size)
+        self._program.set(**_numbers(layout), **daqp_addresses(), unknowns=size)
         # The bounds are written where the QP has them.
         self._program.set(**{name: array for name, array in found.items() if name not in ("lower", "upper")})
         self._program.set(**_composition(layout, condense))

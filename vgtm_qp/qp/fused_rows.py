@@ -67,7 +67,7 @@ def row_function(layout: Layout) -> Bound:
             graph.curvature,
             graph.offset,
             graph.normal,
-            _leg_rows(graph),
+            leg_rows(layout, graph.leg_axes),
             graph.leg_lower,
             *station_rows(graph),
             motion * graph.given[4] if layout.spacings else ca.MX(0, 1),
@@ -77,9 +77,8 @@ def row_function(layout: Layout) -> Bound:
     )
 
 
-def _leg_rows(graph: StepGraph) -> ca.MX:
-    """Return (q, G) the rows of the legs over the free coordinates of the curve."""
-    layout, axes = graph.layout, graph.leg_axes
+def leg_rows(layout: Layout, axes: ca.MX) -> ca.MX:
+    """Return (q, G) the rows of the legs, along `axes` (3, G), over the free coordinates of the curve."""
     rows = ca.MX.zeros(layout.free_curve, len(layout.legs))
     for k, (start, _) in enumerate(layout.legs.tolist()):
         if start == 0:

@@ -1,28 +1,26 @@
 """The engine of long arms: from the positions of the nodes to the step and back by sweeps along the bays.
 
 Its QP is that of the general engine with the solvers of ``qp.long``. The numbers of the QP are written
-directly into the sweeps' inputs, and lengths are closed with the factors of the QP.
+directly into the sweeps' inputs, and lengths are closed with the factors of the QP. Where that can be compiled, one
+call of C does all of it, see ``qp.long.compiled``.
 """
 
 from __future__ import annotations
 
-import casadi as ca
 import numpy as np
 
 from vgtm_qp.arm.arm import Kinematics
-from vgtm_qp.arm.symbols import Bound, Constants, Frames
 from vgtm_qp.arrays import Array
-from vgtm_qp.compiled import Kernel
-from vgtm_qp.qp.answer import Accuracy, Closed, CurvePoint, Settled, StepSolution
-from vgtm_qp.qp.layout import Layout
+from vgtm_qp.qp.answer import Accuracy, Closed, CurvePoint, Move, Settled, StepSolution
 from vgtm_qp.qp.long.chain_data import PeriodValues
+from vgtm_qp.qp.long.compiled import CompiledChain
+from vgtm_qp.qp.long.ends import end_function
 from vgtm_qp.qp.long.solver import ChainSolver
 from vgtm_qp.qp.numbers import Legs, RowNumbers, beyond
 from vgtm_qp.qp.settle import TOO_FAR, enough_length, enough_tip_error, held
-from vgtm_qp.rows import curve as curve_rows
 from vgtm_qp.rows.tip import TipGoal, progress_gradient
 from vgtm_qp.step.closing import Closing, Correct, converge
-from vgtm_qp.step.engine import Engine
+from vgtm_qp.step.engine import Engine, Spent
 from vgtm_qp.step.state import frozen
 from vgtm_qp.step.target import QPInput, Target
 from vgtm_qp.step.task import TipTask
@@ -38,7 +36,8 @@ class ChainEngine(Engine):
         arm, chain = self.layout.arm, solver.chain
         self._solver, self._task, self._data = solver, task, solver.data
         self._values = PeriodValues(chain, solver.data)
-        self._ends = _end_kernel(self.layout)
+        self._ends = end_function(self.layout).kernel()
+        self.compiled = CompiledChain(solver)
         self._closing = solver.closing()
         self._members = chain.members.reshape(-1)
         self._members_at = np.argsort(self._members)
@@ -53,13 +52,35 @@ class ChainEngine(Engine):
 
     @staticmethod
     def serves(solver: ChainSolver) -> bool:
-        """Whether all bays of the solver's arm are alike and its base face is rigid."""
-        if solver.chain.member_places is None:
-            return False
+        """Whether all bays of the solver's arm are alike and its base face is rigid; steps must close whole gaps."""
         layout, arm = solver.layout, solver.layout.arm
+        if solver.chain.member_places is None or np.isfinite(layout.reach):
+            return False
         return not arm.base[arm.end_effector.nodes].any() and (
             not layout.vertices or bool(arm.base[arm.stations.nodes[0]].all())
         )
+
+    def move(self, asked: QPInput, accuracy: Accuracy, spent: Spent) -> Move:
+        """See ``engine.Engine``; by one call of C once that is compiled.
+
+        It does not apply if the path turns within the step, or the base moves.
+        """
+        target, moved = asked.target, None
+        is_straight = target.base is None and target.path.is_straight(target.start, target.end)
+        if is_straight and self.compiled.is_ready:
+            moved = self.compiled.move(asked.linear(self.layout), asked.rows, accuracy)
+            spent("qp")
+        if moved is None:
+            # NumPy may have an answer: without the margin, or rounded differently.
+            return super().move(asked, accuracy, spent)
+        move, settled = moved
+        if move.closed is None and settled.error < np.inf:
+            bounds, goal = (target.lower, target.upper), target.goal(move.progress)
+            closed = self._any_closing.close(settled.q, *bounds, accuracy.member)
+            off = self._task.off(closed.tip_position, closed.tip_rotation, goal)
+            if off <= accuracy.tip and closed.error <= accuracy.member:
+                move = move._replace(closed=closed)
+        return move
 
     def solve(self, asked: QPInput) -> StepSolution:
         """See ``engine.Engine``."""
@@ -109,7 +130,8 @@ class ChainEngine(Engine):
     ) -> Settled | None:
         """See ``engine.Engine``: each step corrects the lengths, and the remaining tip error by the actuators.
 
-        The actuated lengths are those of the QP's answer plus a correction that brings the tip to its goal.
+        The actuated lengths are those of the QP's answer plus a correction that brings the tip to its goal: by what it
+        will miss there once the lengths are corrected.
         If faces are held on the curve, the lengths follow from the curve as far as bounds allow.
         """
         closing, solver, bounds = self._closing, self._solver, (target.lower, target.upper)
@@ -120,22 +142,30 @@ class ChainEngine(Engine):
         gain: Array | None = None
         steers = by_strokes = solver.settles == "strokes"
 
+        def missing(own: Array) -> tuple[Array, float]:
+            tip = self._tip_of(own, turned=self._task.turns is not None)
+            return self._task.error(*tip, goal), self._task.off(*tip, goal)
+
         def measure(own: Array) -> tuple[float, Correct | None]:
             nonlocal wanted, gain, steers
             is_off = steers
-            if by_strokes and own is not first:
-                tip = self._tip_of(own, turned=self._task.turns is not None)
-                error, off = self._task.error(*tip, goal), self._task.off(*tip, goal)
-                if off > accuracy.start:
-                    return np.inf, None
-                if steers and gain is None and off > enough_tip:
-                    gain = solver.gain(held(*self._answer, self.layout.arm.fineness))
-                    steers = gain is not None
-                if is_off := gain is not None and off > enough_tip:
-                    wanted = wanted + gain @ error
-                    self._aim(wanted, curve.vertices, *bounds)
             closer, worst = closing.step(own)
-            return worst, closer.copy if is_off or not worst <= enough else None
+            if steers and own is not first:
+                off = missing(own)[1]
+                if not off <= accuracy.start:
+                    return np.inf, None
+                is_off = off > enough_tip
+            if not is_off and worst <= enough:
+                return worst, None
+            if steers and (ahead := missing(closer))[1] > enough_tip:
+                if gain is None:
+                    gain = solver.gain(held(*self._answer, self.layout.arm.fineness))
+                steers = gain is not None
+                if gain is not None:
+                    wanted = wanted + gain @ ahead[0]
+                    self._aim(wanted, curve.vertices, *bounds)
+                    closer += solver.gain_moved @ ahead[0]
+            return worst, closer.copy
 
         own, worst = converge(first, measure, TOO_FAR * self.layout.arm.unit)
         closed = self._closed(X, own, worst)
@@ -175,33 +205,3 @@ class ChainEngine(Engine):
         ends.inputs[0][:] = corners.reshape(-1)
         ends()
         return position, ends.outputs[0].reshape(3, 3).T.copy()
-
-
-def _end_kernel(layout: Layout) -> Kernel:
-    """Return the function of the two ends of an arm: the tip's frame, and the curve's base.
-
-    Arguments: the tip's nodes X, Y (3, K), where residuals and where Jacobians are evaluated; the nodes of the first
-    station (3, 3) when the base has moved; control vertices (3, V). Results: rotation of the tip at X, its spin
-    (3, 3K) at Y; offset (3, V) and normal (3,) of the curve at the base, see ``ChainData``; axes (3, G) and bounds
-    (G) of the curve's legs.
-    """
-    arm, tip, constants, vertices = layout.arm, layout.arm.end_effector, Constants(), layout.vertices
-    X, Y = (ca.MX.sym(name, 3, len(tip.nodes)) for name in "XY")
-    base, points = ca.MX.sym("base", 3, 3), ca.MX.sym("p", 3, vertices)
-    rotation, spin, offset, normal = ca.MX.eye(3), ca.MX.zeros(3, Y.numel()), ca.MX(3, 0), ca.MX.zeros(3)
-    if tip.has_frame:
-        frames = Frames(
-            arm.home[tip.nodes][None], tip.frame[None], np.arange(len(tip.nodes)), constants, "tip"
-        )
-        rotation, spin = frames.at(X)[0], frames.at(Y)[1]
-    if vertices:
-        home, weights = arm.home[arm.stations.nodes[:1]], ca.DM(arm.stations.weights[0])
-        turned, _ = Frames(home, arm.stations.frames[:1], np.arange(3), constants, "base").at(base)
-        offset, normal = curve_rows.base_offset(base @ weights, turned, points), turned[:, 2]
-    axes, lower = ca.MX.zeros(3, 0), ca.MX.zeros(0)
-    if len(layout.legs):
-        least = constants.add("least_leg", np.array([layout.least_leg]))
-        axes, lower = curve_rows.legs(points, normal, least, both=len(layout.legs) > 1)
-    results = [ca.densify(result) for result in (rotation, spin, offset, normal, axes, lower)]
-    function = ca.Function("ends", [X, Y, base, points, *constants.symbols], results)
-    return Bound(function, constants.values).kernel()

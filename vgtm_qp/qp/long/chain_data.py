@@ -33,6 +33,8 @@ class ChainData:
         `is_reversed`.
     part : dict
         Their parts by name.
+    sizes : dict of dicts
+        See ``elimination.Inputs``.
     turn_squares : (n, 9f)
         Products t t' of the rows t of ``tangent_curve``, summed over the two angles of a station.
     window, members, station_order : (n, w + m), (n, 3m), (n, f, 3) int
@@ -50,7 +52,7 @@ class ChainData:
     """
 
     def __init__(self, chain: Chain, sizes: dict[str, dict[str, int]], *, is_reversed: bool = False) -> None:
-        self._chain, self.is_reversed = chain, is_reversed
+        self._chain, self.sizes, self.is_reversed = chain, sizes, is_reversed
         layout, order = chain.layout, slice(None, None, -1 if is_reversed else 1)
         self.part: dict[str, Array] = {}
         arrays = []
@@ -239,7 +241,7 @@ class PeriodValues:
         self._closes, tracked = inputs[8].reshape(-1, 2), data.stations
         self._is_hard = np.stack([layout.hard_gaps[tracked, 0], layout.hard_tilts[tracked, 0]], axis=1)
         inputs[2][:], inputs[3][:] = layout.arm.home_quantities[data.members], ~bays.actuated[data.members]
-        for array, constants in zip(inputs[4:6], _frame_constants(chain, data), strict=True):
+        for array, constants in zip(inputs[4:6], frame_constants_of(chain, data), strict=True):
             array[:] = constants.reshape(array.shape)
         # The first period's members stand on base nodes, which are not unknowns.
         self._first = -1 if data.is_reversed else 0
@@ -317,7 +319,7 @@ def period_values(chain: Chain) -> ca.Function:
     return dense_function("values", [X, Y, home, fixed, angles, alignment, curve, motion, closes], outputs)
 
 
-def _frame_constants(chain: Chain, data: ChainData) -> tuple[Array, Array]:
+def frame_constants_of(chain: Chain, data: ChainData) -> tuple[Array, Array]:
     """Return angles (K, 6) and alignments (K, 3, 3), columns first, of the stations in the order of `data`.
 
     A station with its nodes in clockwise order has y- and z-axis of its fitted frame reversed.

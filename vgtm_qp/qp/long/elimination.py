@@ -134,6 +134,8 @@ class Elimination:
         Number of free curve coordinates, 3V - 5.
     freedom : int
         Free motions of a period.
+    gain_parts : list
+        For each stage free, G, W, Wb and S, see :meth:`factor`, which sets them.
     """
 
     def __init__(self, chain: Chain) -> None:
@@ -156,7 +158,7 @@ class Elimination:
             split = range_and_null(J[hard, own])
             self.stages.append(Stage(own, before, hard, actuated, -J[hard, before], rhs[hard], *split))
         self.freedom = sum(stage.freedom for stage in self.stages)
-        self._gain_parts: list[ca.SX] = []
+        self.gain_parts: list[ca.SX] = []
 
     def centre_row(self, k: int) -> ca.SX:
         """Return the constant (3, 3w + 3m) Jacobian of the centre of station `k`."""
@@ -179,16 +181,18 @@ class Elimination:
         turned = curve_rows.weighted_columns(inputs.slopes[k], inputs.normal, inputs.tangent_curve[k])
         return point, turned
 
-    def factor(self) -> ca.Function:
-        """Return (carry, head, tail, table) -> (carry, gains, Y): one period of the recursion.
+    def factor(self, *, curved: bool = True) -> ca.Function:
+        """Return (carry, head, tail, table) -> (carry, gains, Y, placed): one period of the recursion.
 
         The carry holds the upper half of the Hessian in the live coordinates, their linear terms for every
         curve coordinate and for 1, and the gradient of the curve coordinates. Y (freedom, 3V - 5 + 1) is
-        stored row by row.
+        stored row by row. `placed` (3m,) are displacements by the errors of fixed members alone. Unless it is `curved`,
+        there are no terms of curve coordinates: C adds these.
         """
-        inputs, weights, columns = self.inputs, self.chain.layout.weights, self.curve + 1
+        inputs, weights, curve = self.inputs, self.chain.layout.weights, self.curve if curved else 0
+        columns = curve + 1
         upper = ca.Sparsity.upper(len(self.live))
-        ends = offsets([upper.nnz(), len(self.live) * columns, self.curve])
+        ends = offsets([upper.nnz(), len(self.live) * columns, curve])
         carry = ca.SX.sym("carry", ends[-1])
         handed, linear, curve_gradient = ca.vertsplit(carry, ends)
         H, V = ca.SX(self.size, self.size), ca.SX(self.size, columns)
@@ -204,11 +208,12 @@ class Elimination:
             centre, tangent = self.centre_row(k), self.tangent_row(k)
             point, turned = self.curve_columns(k)
             H += symmetric(weights.tracking * (centre.T @ centre) + weights.tangent * (tangent.T @ tangent))
-            V += weights.tracking * (centre.T @ ca.horzcat(-point, inputs.gap[k]))
-            V += weights.tangent * (tangent.T @ ca.horzcat(turned, inputs.tilt[k]))
+            V += weights.tracking * (centre.T @ ca.horzcat(-point[:, :curve], inputs.gap[k]))
+            V += weights.tangent * (tangent.T @ ca.horzcat(turned[:, :curve], inputs.tilt[k]))
         H = ca.sparsify(H)
         gains: list[ca.SX] = []
         outer: list[ca.SX] = []
+        displaced: list[ca.SX] = []
         for stage in reversed(self.stages):
             G, N, T, u, before = stage.G, stage.N, stage.T, stage.own, stage.before
             placed = G @ stage.rhs
@@ -225,20 +230,19 @@ class Elimination:
             H = ca.sparsify(symmetric(H[before, before] + T.T @ (M @ T) + cross + cross.T - Wb.T @ Wb))
             curve_gradient += total[:, :-1].T @ placed - Y[:, :-1].T @ Y[:, -1]
             gains = [free, G, W, Wb, small_inverse(inputs.jacobian[stage.actuated, u] @ free), *gains]
-            outer = [Y, *outer]
-        self._gain_parts = gains
+            outer, displaced = [Y, *outer], [placed, *displaced]
+        self.gain_parts = gains
         handed = ca.vertcat(nonzeros(ca.project(H, upper)), ca.densify(ca.vec(V)), curve_gradient)
         packed = ca.vertcat(*[nonzeros(part) for part in gains])
-        return dense_function(
-            "factor", [carry, inputs.head, inputs.tail, inputs.table], [handed, packed, ca.vertcat(*outer).T]
-        )
+        outputs = [handed, packed, ca.vertcat(*outer).T, ca.vertcat(*displaced)]
+        return dense_function("factor", [carry, inputs.head, inputs.tail, inputs.table], outputs)
 
     def _gains(self) -> tuple[ca.SX, list[list[ca.SX]]]:
         """Return the symbols of the gains and, per stage, (free, G, W, Wb, S); `factor` fixes their sparsity.
 
         S takes changes of a stage's actuated lengths to its scaled free motions.
         """
-        vector, pieces = symbols_like([part.sparsity() for part in self._gain_parts], "gains")
+        vector, pieces = symbols_like([part.sparsity() for part in self.gain_parts], "gains")
         return vector, [pieces[5 * k : 5 * k + 5] for k in range(len(self.stages))]
 
     def columns(self, count: int) -> ca.Function:
@@ -289,17 +293,16 @@ class Elimination:
         return dense_function("forward", [carry, self.inputs.head, vector, z], outputs)
 
     def strokes(self, count: int) -> ca.Function:
-        """Return (carry, head, gains, z (freedom, count)) -> (carry, J u of the actuated members), all without rhs.
+        """Return (carry, head, gains, z (freedom, count)) -> (carry, J u of the actuated members, u), all without rhs.
 
-        Each column of `z` is one motion; z and J u are stored row by row.
+        Each column of `z` is one motion; z, J u and u (3m, count) are stored row by row.
         """
         vector, gains = self._gains()
         carry, rows = ca.SX.sym("carry", len(self.live), count), ca.SX.sym("z", count, self.freedom)
         u = self._moved(carry, rows.T, gains, [ca.SX(len(stage.hard), count) for stage in self.stages])
         changed = self.inputs.jacobian[self.actuated, :] @ u
-        return dense_function(
-            "strokes", [carry, self.inputs.head, vector, rows], [u[self.live, :], changed.T]
-        )
+        outputs = [u[self.live, :], changed.T, u[self.chain.before :, :].T]
+        return dense_function("strokes", [carry, self.inputs.head, vector, rows], outputs)
 
     def _moved(self, u: ca.SX, z: ca.SX, gains: list[list[ca.SX]], rhs: list[ca.SX]) -> ca.SX:
         """Return displacements (3w + 3m, c) for free motions `z` (freedom, c) after those `u` (3w, c)."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,7 +21,7 @@ from vgtm_qp.qp.residual import loose, refuse_large, relative
 
 SINGULAR = "the QP is singular: the arm is in a singular pose, or a term that it needs has weight zero"
 
-_PRESSES = 1e-9
+PRESSES = 1e-9
 """Least multiplier of a row that the next QP starts with: interior-point solvers give each row some."""
 
 
@@ -36,14 +37,21 @@ class ChainSolver(ABC):
     chain : Chain
     data : ChainData
         The numbers of the QP except those of ``RowNumbers``.
+    elimination : Elimination
+    gains : list
+        Matrices of the period's gains, the second result of the elimination: for their sparsity.
+    dense : DenseSolver
     """
 
     settles = "curve"
+    gain_moved: Array
+    """Displacements (n m, 3, n_e) by the motions of the last gain, nodes in the chain's order."""
+    gains: list[ca.SX]
 
     def __init__(
         self, elimination: Elimination, size: int, solver: DenseSolver, *, is_reversed: bool
     ) -> None:
-        self._solver = solver
+        self.dense, self.elimination = solver, elimination
         chain = self.chain = elimination.chain
         self.layout = chain.layout
         self.data = ChainData(chain, elimination.inputs.sizes, is_reversed=is_reversed)
@@ -92,11 +100,11 @@ class ChainSolver(ABC):
             least = self._least(combined[:-1])
             return table.values(*least, self._free, progress)
 
-        answer = solve_rows(table, self._size + 1, columns, values, self._active, self._solver)
+        answer = solve_rows(table, self._size + 1, columns, values, self._active, self.dense)
         nodes, vertices = self.displacements(), self.data.vertices(self._free)
         self._check(table, answer, nodes, vertices)
         self._last, (found, multipliers) = (table, answer), answer[:2]
-        active = np.flatnonzero(np.abs(multipliers) > _PRESSES)
+        active = np.flatnonzero(np.abs(multipliers) > PRESSES)
         self._active = {table.key(k) for k in active.tolist() if k >= table.equal}
         return StepSolution(
             nodes=nodes,
@@ -128,6 +136,10 @@ class ChainSolver(ABC):
         primal = norm(np.concatenate([left, beyond(values, table.lower, table.upper)]))
         off = max(norm(dual), loose(multipliers, values, table.lower, table.upper))
         refuse_large(primal, relative(off, forces, multipliers), "the elimination")
+
+    @abstractmethod
+    def functions(self) -> dict[str, ca.Function]:
+        """Return a period's functions by the names that ``native/chain.c`` gives them; its periods are alike."""
 
     @abstractmethod
     def closing(self) -> ChainClosing:

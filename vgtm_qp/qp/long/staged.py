@@ -6,6 +6,7 @@ are global unknowns beside them.
 
 from __future__ import annotations
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dtrtrs
@@ -28,13 +29,15 @@ class StagedSolver(ChainSolver):
     settles = "strokes"
 
     def __init__(self, chain: Chain, solver: DenseSolver = DAQP) -> None:
-        elimination = self._elimination = Elimination(chain)
+        elimination = Elimination(chain)
         periods, own = chain.periods, chain.nodes.shape[1]
         self._freedom = periods * elimination.freedom
         # The recursion runs from the tip to the base.
         super().__init__(elimination, self._freedom + elimination.curve, solver, is_reversed=True)
         data = self.data
-        self._factor = Sweep(elimination.factor(), periods, data.head, data.tail, data.table)
+        factor = elimination.factor()
+        self.gains = elimination.gain_parts
+        self._factor = Sweep(factor, periods, data.head, data.tail, data.table)
         gains = self._factor.outputs[1]
         self._through = Sweep(elimination.columns(BLOCK), periods, data.head, gains)
         self._balance = Sweep(elimination.balance(), periods, data.head, gains)
@@ -56,6 +59,16 @@ class StagedSolver(ChainSolver):
         self._moved_at = np.where(is_free, chain.node_period * own + chain.node_place, -1)
         self._outer = self._factor.outputs[2].reshape(self._freedom, -1)
         self._fixed = ~chain.bays.actuated[chain.members.reshape(-1)]
+
+    def functions(self) -> dict[str, ca.Function]:
+        """See :class:`ChainSolver`."""
+        graphs = self.elimination
+        return {
+            "eliminate": graphs.factor(curved=False),
+            "balance": graphs.balance(),
+            "forward": graphs.forward(),
+            "close": graphs.close(),
+        }
 
     def gain(self, held: NDArray[np.bool_]) -> Array | None:
         """Return the changes (n_a, n_e) of the actuated lengths that move the tip by one unit of each of its rows.
@@ -87,11 +100,12 @@ class StagedSolver(ChainSolver):
         sweep, periods = self._strokes, self.chain.periods
         sweep.inputs[3].reshape(periods, -1)[:] = motions.reshape(periods, -1)[::-1]
         sweep()
+        self.gain_moved = sweep.outputs[2].reshape(-1, 3, motions.shape[1])
         return sweep.outputs[1].reshape(-1, motions.shape[1]).take(self._among_actuated, axis=0)
 
     def closing(self) -> ChainClosing:
         """See :class:`ChainSolver`."""
-        return ChainClosing(self.chain, self._elimination.close(), self._forward_head, self._forward_gains)
+        return ChainClosing(self.chain, self.elimination.close(), self._forward_head, self._forward_gains)
 
     def _columns(self, nodes: Index, coefficients: Array, curve: Array) -> Array:
         passed = self._through.outputs[1].reshape(self._freedom, BLOCK)

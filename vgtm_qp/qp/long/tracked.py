@@ -39,7 +39,7 @@ class Following:
         self._stations = range(chain.stations.shape[1])
         self._centre = ca.vertcat(*[elimination.centre_row(k) for k in self._stations])
         inverse = small_inverse(self._centre @ motions)
-        self._gains = [*(stage.G for stage in elimination.stages), ca.sparsify(motions @ inverse)]
+        self.gains = [*(stage.G for stage in elimination.stages), ca.sparsify(motions @ inverse)]
 
     def _placed(self, before: ca.SX, rhs: list[ca.SX], gains: list[ca.SX], gap: ca.SX) -> ca.SX:
         """Return (3w + 3m, c) displacements after those `before` (3w, c), for each stage's `rhs` and for `gap`."""
@@ -47,6 +47,11 @@ class Following:
         for stage, G, wanted in zip(self._elimination.stages, gains[:-1], rhs, strict=True):
             moved = ca.vertcat(moved, G @ (stage.T @ moved + wanted))
         return moved + gains[-1] @ (gap - self._centre @ moved)
+
+    def factor(self) -> ca.Function:
+        """Return (head) -> (gains): G of each stage and B, with which C responds to the curve."""
+        gains = ca.vertcat(*[nonzeros(part) for part in self.gains])
+        return dense_function("follow", [self._elimination.inputs.head], [gains])
 
     def response(self) -> ca.Function:
         """Return (carry, head, tail, table) -> (carry, gains, D, R, U): the responses to the curve.
@@ -61,7 +66,7 @@ class Following:
         rhs = [ca.horzcat(ca.SX(len(stage.hard), columns - 1), stage.rhs) for stage in elimination.stages]
         on_curve = [elimination.curve_columns(k) for k in self._stations]
         gap = ca.vertcat(*[ca.horzcat(on_curve[k][0], -inputs.gap[k]) for k in self._stations])
-        moved = self._placed(before.T, rhs, self._gains, gap)
+        moved = self._placed(before.T, rhs, self.gains, gap)
         strokes = inputs.jacobian[elimination.actuated, :] @ moved
         strokes[:, -1] -= inputs.rhs[elimination.actuated]
         angles = [
@@ -69,7 +74,7 @@ class Following:
             for k in self._stations
         ]
         own = list(range(elimination.chain.before, elimination.size))
-        gains = ca.vertcat(*[nonzeros(part) for part in self._gains])
+        gains = ca.vertcat(*[nonzeros(part) for part in self.gains])
         outputs = [moved[elimination.live, :].T, gains, strokes.T, ca.vertcat(*angles).T]
         if elimination.live != own:
             outputs.append(moved[own, :].T)
@@ -81,7 +86,7 @@ class Following:
         Only fixed members have target lengths; the lengths of actuated members follow.
         """
         elimination = self._elimination
-        vector, gains = symbols_like([part.sparsity() for part in self._gains], "gains")
+        vector, gains = symbols_like([part.sparsity() for part in self.gains], "gains")
         aim, curve = ca.SX.sym("aim", elimination.chain.own), ca.SX.sym("curve", 3 * len(self._stations))
 
         def step(moved: ca.SX, X: ca.SX, lengths: ca.SX) -> tuple[ca.SX, ca.SX]:
@@ -98,8 +103,9 @@ class TrackedSolver(ChainSolver):
     def __init__(self, chain: Chain, solver: DenseSolver = DAQP) -> None:
         elimination = Elimination(chain)
         super().__init__(elimination, elimination.curve, solver, is_reversed=False)
-        self._graphs, data = Following(elimination), self.data
-        self._following = Sweep(self._graphs.response(), chain.periods, data.head, data.tail, data.table)
+        graphs, data = Following(elimination), self.data
+        self._graphs, self.gains = graphs, graphs.gains
+        self._following = Sweep(graphs.response(), chain.periods, data.head, data.tail, data.table)
         self._changes = Sweep(elimination.changes(), chain.periods, data.head)
         columns, own = self._curve + 1, chain.nodes.shape[1]
         self._strokes, self._angles = (output.reshape(-1, columns) for output in self._following.outputs[2:4])
@@ -113,6 +119,15 @@ class TrackedSolver(ChainSolver):
         is_free = chain.node_period >= 0
         self._place = np.where(is_free, (chain.node_period + 1) * own + chain.node_place, 0)
         self._one = np.ones(columns)
+
+    def functions(self) -> dict[str, ca.Function]:
+        """See :class:`ChainSolver`."""
+        graphs = self._graphs
+        return {
+            "eliminate": graphs.factor(),
+            "changes": self.elimination.changes(),
+            "close": graphs.hold(),
+        }
 
     def closing(self) -> ChainClosing:
         """See :class:`ChainSolver`: keeps the stations on the curve, too."""

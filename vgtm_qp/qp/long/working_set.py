@@ -20,9 +20,9 @@ from vgtm_qp.qp.residual import InfeasibleStepError
 BLOCK = 8
 """Least number of violated rows that enter the dual QP at once."""
 
-_NO_ROW = 1e-11
-_DEPENDENT = 1e-14
-_INDEPENDENT = 1e-4
+NO_ROW = 1e-11
+DEPENDENT = 1e-14
+INDEPENDENT = 1e-4
 """Ratio of the least to the greatest Cholesky pivot above which rows are far from dependent."""
 _REFINEMENTS = 4
 
@@ -170,7 +170,7 @@ def _all_active(
         return None
     factor, failed = dpotrf(gram, lower=1)
     pivots = factor.diagonal()
-    if failed or not pivots.min() > _INDEPENDENT * pivots.max():
+    if failed or not pivots.min() > INDEPENDENT * pivots.max():
         return None
     found: Array = dpotrs(factor, values - np.where(above, upper, lower), lower=1)[0]
     right = np.where(above, found, -found)[~equal] >= 0.0
@@ -203,7 +203,7 @@ def dual_solution(
     multipliers = np.zeros(len(norm))
     if not np.all(np.isfinite(norm)):
         raise SolverError("the QP is singular: the arm is in a singular pose, or all weights are zero")
-    empty = norm < _NO_ROW
+    empty = norm < NO_ROW
     if empty.any():
         outside = np.maximum(lower - values, values - upper)[empty]
         if outside.max() > 1e-9:
@@ -213,7 +213,7 @@ def dual_solution(
         return multipliers, 0
     scale = 1.0 / norm[kept]
     scaled = gram[np.ix_(kept, kept)] * scale[:, None] * scale
-    factor, pivot, rank, _ = dpstrf(scaled, tol=_DEPENDENT * len(kept), lower=1)
+    factor, pivot, rank, _ = dpstrf(scaled, tol=DEPENDENT * len(kept), lower=1)
     rows = np.zeros((len(kept), rank))
     rows[pivot - 1] = np.tril(factor)[:, :rank]
     bounds = []

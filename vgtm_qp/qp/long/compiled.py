@@ -1,0 +1,401 @@
+"""The step of a long arm in one call of C: see ``native/chain.c``, which does what solvers and engine do by NumPy."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from vgtm_qp.arrays import Array
+from vgtm_qp.compiled import Kernel
+from vgtm_qp.native import Code, Program, building
+from vgtm_qp.qp.answer import Accuracy, Closed, Move, StepSolution
+from vgtm_qp.qp.daqp import DAQP
+from vgtm_qp.qp.fused import daqp_addresses
+from vgtm_qp.qp.layout import Layout
+from vgtm_qp.qp.linearise import StepInput
+from vgtm_qp.qp.long.chain_data import ChainData, frame_constants_of, period_values
+from vgtm_qp.qp.long.ends import begin_function, missing_tip_function
+from vgtm_qp.qp.long.products import products
+from vgtm_qp.qp.long.solver import PRESSES, ChainSolver
+from vgtm_qp.qp.long.sparse_symbols import offsets
+from vgtm_qp.qp.long.working_set import BLOCK, DEPENDENT, INDEPENDENT, NO_ROW
+from vgtm_qp.qp.numbers import ClearanceRows
+from vgtm_qp.qp.residual import TOLERANCE
+from vgtm_qp.qp.settle import (
+    AT_BOUND,
+    LEFT,
+    MOST_STEPS,
+    TOO_FAR,
+    WORST_CONDITION,
+    enough_length,
+    enough_tip_error,
+)
+
+_ROOM, _NEAR, _SLOTS = 64, 64, 4
+"""Capacity at first: rows of the dense QP, rows of clearance, and nodes of each of these."""
+
+_NOWHERE: Array = np.zeros((0, 3))
+
+
+class CompiledChain:
+    """Takes the steps of a solver's arm by C once its functions are compiled, if the dense QPs are for DAQP."""
+
+    def __init__(self, solver: ChainSolver) -> None:
+        self._solver = solver
+        self._layout, self._chain = solver.layout, solver.chain
+        self._begin, self._missing = (
+            begin_function(self._layout).kernel(),
+            missing_tip_function(self._layout).kernel(),
+        )
+        self._given = solver.functions()
+        self._functions = {name: Kernel(function) for name, function in self._given.items()}
+        self._functions["values"] = Kernel(period_values(self._chain))
+        self.library = building()
+        self._is_ready = None if solver.dense is DAQP and daqp_addresses() else False
+        self._accuracy: Accuracy | None = None
+
+    @property
+    def kernels(self) -> tuple[Kernel, ...]:
+        """The functions that C calls."""
+        return self._begin, self._missing, *self._functions.values()
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether the C and all its functions are compiled; always false if they cannot be."""
+        if self._is_ready is None:
+            self.library.ask()
+            for kernel in self.kernels:
+                kernel.prepare()
+            if self.library.is_settled and all(kernel.is_done for kernel in self.kernels):
+                is_compiled = all(kernel.is_compiled for kernel in self.kernels)
+                self._is_ready = is_compiled and self.library.library is not None
+                if self._is_ready:
+                    self._start()
+        return bool(self._is_ready)
+
+    def move(
+        self, asked: StepInput, clearance: ClearanceRows, accuracy: Accuracy
+    ) -> tuple[Move, Closed] | None:
+        """Return where the QP's answer leads, and the configuration at which settling ended; None without an answer.
+
+        The goal moves straight, and the base is at rest. The move has a closed configuration if all is exact; otherwise
+        the second result says how far settling came, its error infinite if it does not count.
+        """
+        if accuracy is not self._accuracy:
+            self._aim(accuracy)
+        self._load(asked)
+        self._take(clearance)
+        code = Code.CROWDED
+        while code == Code.CROWDED:
+            self._points[:] = asked.vertices.reshape(-1)
+            self._q[:] = asked.q
+            code = self._program.call("chain_move", TOLERANCE)
+            if code == Code.CROWDED:
+                self.reserve(2 * self._room)
+        if code not in (Code.DONE, Code.UNSETTLED, Code.OFF_CURVE):
+            return None
+        data, count, near = self._program.data, self._strokes_at + len(self._x), len(clearance)
+        solution = StepSolution(
+            nodes=_NOWHERE,
+            actuators=self._x.copy(),
+            vertices=_NOWHERE,
+            progress=data.step,
+            actuator_multipliers=self._y.copy(),
+            clearance_multipliers=-self._every[count : count + near],
+            iterations=data.iterations,
+        )
+        turned = self._missing.outputs[2].reshape(3, 3).T.copy()
+        error = np.inf if code == Code.UNSETTLED else data.error
+        closed = Closed(
+            self._q.copy(), self._quantities.copy(), error, self._missing.outputs[1].copy(), turned
+        )
+        points, torsion = self._points.reshape(-1, 3).copy(), np.zeros(0)
+        settled = closed if code == Code.DONE else None
+        begun = self._begun.copy()
+        begun[self._layout.arm.base] = asked.q[self._layout.arm.base]
+        return Move(solution, begun, points, torsion, data.reached, data.furthest, settled), closed
+
+    def _aim(self, accuracy: Accuracy) -> None:
+        """Settle to that `accuracy` from now on."""
+        home, self._accuracy = self._layout.arm.home_configuration, accuracy
+        self._program.set(
+            member_error=accuracy.member,
+            tip_error=accuracy.tip,
+            start=accuracy.start,
+            enough_length=enough_length(home, accuracy.member),
+            enough_tip=enough_tip_error(home, accuracy.tip),
+        )
+
+    def _load(self, asked: StepInput) -> None:
+        """Write the state, the goal and the boxes."""
+        layout, inputs = self._layout, self._begin.inputs
+        self._at[:], self._lower[:], self._upper[:] = asked.at, asked.lower, asked.upper
+        self._pull[:] = 0.0
+        if layout.vertices:
+            inputs[2][:] = asked.q[layout.arm.stations.nodes[0]].reshape(-1)
+            if asked.motion:
+                self._pull[:] = layout.vertex_gradient(asked.vertices, asked.vertex_goals)
+        goal = asked.goal
+        inputs[4][:], inputs[5][:] = goal.position, goal.rotation.T.reshape(-1)
+        inputs[6][:], inputs[7][:] = goal.velocity, goal.spin
+        inputs[8][0], inputs[9][0] = asked.motion, asked.progress
+
+    def _take(self, clearance: ClearanceRows) -> None:
+        """Write the rows of clearance."""
+        near, slots = clearance.nodes.shape
+        data = self._program.data
+        if near > self._near or slots > self._slots:
+            self._make_room(max(2 * near, self._near), max(slots, self._slots))
+        data.near = near
+        if near:
+            if data.slots != slots:
+                data.pressing, data.slots = 0, slots
+            self._near_nodes[: near * slots] = clearance.nodes.reshape(-1)
+            self._near_rows[: 3 * near * slots] = clearance.coefficients.reshape(-1)
+            self._near_lower[:near] = clearance.lower
+
+    def _start(self) -> None:
+        """Allocate the arrays, and give their addresses to C."""
+        layout, arm = self._layout, self._layout.arm
+        self._program = program = Program("Chain")
+        self._q, self._at, self._begun = (np.zeros(arm.home.shape) for _ in range(3))
+        self._points, self._pull = self._begin.inputs[3], np.zeros((layout.vertices, 3))
+        self._x, self._y, self._lower, self._upper = (np.zeros(len(arm.actuators)) for _ in range(4))
+        self._quantities = np.zeros(len(arm.quantity_names))
+        for argument in (1, 2, 3, 4):
+            # Goal, its turn, and the rates of both.
+            self._missing.bind_input(argument, self._begin.inputs[argument + 3])
+        program.set(
+            begin=self._begin,
+            missing=self._missing,
+            q=self._q,
+            at=self._at,
+            begun=self._begun,
+            points=self._points,
+            pull=self._pull,
+            x=self._x,
+            y=self._y,
+            lower=self._lower,
+            upper=self._upper,
+            quantities=self._quantities,
+            velocity=self._begin.inputs[6],
+            spin=self._begin.inputs[7],
+            motion=self._begin.inputs[8],
+            progress=self._begin.inputs[9],
+            **self._functions,
+            **daqp_addresses(),
+        )
+        solver, sizes = self._solver, _sizes(self._solver)
+        data = ChainData(self._chain, solver.data.sizes)
+        program.set(head=data.head, tail=data.tail, table=data.table)
+        program.set(**sizes, **_constants(solver, data), **_tolerances(layout), **products(solver, sizes))
+        self._strokes_at = sizes["tips"] + sizes["held"] + sizes["ends"] + 1 + sizes["legs"]
+        program.set(**_workspace(sizes, self._given))
+        self._near = self._slots = 0
+        self._make_room(_NEAR, _SLOTS)
+        self.reserve(_ROOM)
+
+    def _make_room(self, near: int, slots: int) -> None:
+        """Make room for `near` rows of clearance over `slots` nodes each."""
+        self._near, self._slots = near, slots
+        self._near_nodes = np.zeros(near * slots, dtype=np.int32)
+        self._near_rows, self._near_lower = np.zeros(3 * near * slots), np.zeros(near)
+        total = self._strokes_at + len(self._x) + near
+        self._every = np.zeros(total)
+        rows = {name: np.zeros(total) for name in ("low", "high", "value", "out")}
+        marks = {name: np.zeros(total, dtype=np.int32) for name in ("state", "remembered")}
+        pressed = np.zeros(near * slots, dtype=np.int32)
+        self._program.set(
+            near_nodes=self._near_nodes,
+            near_rows=self._near_rows,
+            near_lower=self._near_lower,
+            every=self._every,
+            pressed=pressed,
+            pressing=0,
+            slots=slots,
+            **rows,
+            **marks,
+        )
+
+    def reserve(self, room: int) -> None:
+        """Make room for that many rows in the dense QP."""
+        data, self._room = self._program.data, room
+        size = data.periods * data.freedom + data.curve + 1
+        self._program.set(
+            room=room,
+            row=np.zeros(room, dtype=np.int32),
+            kept=np.zeros(4 * room + BLOCK, dtype=np.int32),
+            column=np.zeros((room, size)),
+            gram=np.zeros((room, room)),
+            multiplier=np.zeros(room),
+            level=np.zeros(room),
+            scaled=np.zeros(size + room),
+            dense=np.zeros(4 * room**2 + 8 * room + 64),
+        )
+
+
+def _sizes(solver: ChainSolver) -> dict[str, int]:
+    """Return by field how many there are of what, and where parts of a period's numbers begin."""
+    layout, chain, data = solver.layout, solver.chain, solver.data
+    gaps, tilts = layout.ends_at_tip and not layout.hard_tracking, layout.ends_along_tip
+    at: dict[str, int] = {}
+    for parts in data.sizes.values():
+        at |= zip(parts, offsets(parts.values())[:-1], strict=True)
+    return {
+        "periods": chain.periods,
+        "own": chain.own,
+        "before": chain.before,
+        "moving": int(chain.actuated.sum()),
+        "stations": int(chain.stations.shape[1]),
+        "freedom": 0 if layout.hard_tracking else solver.elimination.freedom,
+        "actuators": len(layout.arm.actuators),
+        "held": len(chain.locked),
+        "tips": len(layout.tip_rows),
+        "tip_nodes": len(layout.arm.end_effector.nodes),
+        "vertices": layout.vertices,
+        "curve": layout.free_curve,
+        "ends": 3 * gaps + 2 * tilts,
+        "end_gaps": int(gaps),
+        "legs": len(layout.legs),
+        "width": 4 * (layout.free_curve // 4 + 1),
+        "follows": int(layout.hard_tracking),
+        "stages": len(chain.stage_sizes),
+        "rhs_at": at["rhs"],
+        "heads": data.head.shape[1],
+        "tails": data.tail.shape[1],
+        "tables": data.table.shape[1],
+        "faces_at": at["tangent_face"],
+        "gradient_at": at["actuator_gradient"],
+        "over_slope_at": at["tangent_curve"],
+        "gap_at": at["gap"],
+        "tilt_at": at["tilt"],
+        "normal_at": at["normal"],
+    }
+
+
+def _constants(solver: ChainSolver, data: ChainData) -> dict[str, Any]:
+    """Return by field the tables of a chain, and the weights of its QP."""
+    layout, chain, arm, weights = solver.layout, solver.chain, solver.layout.arm, solver.layout.weights
+    own, is_free = chain.nodes.shape[1], chain.node_period >= 0
+    members, fixed = chain.members, ~chain.bays.actuated[chain.members]
+    places = np.argsort(members.reshape(-1))
+    moving = np.where(
+        chain.actuated, np.cumsum(np.tile(chain.actuated, (chain.periods, 1))).reshape(members.shape) - 1, -1
+    )
+    base_row, base_column = np.nonzero(chain.pattern[:, : chain.before])
+    hard = np.stack([layout.hard_gaps[data.stations, 0], layout.hard_tilts[data.stations, 0]], axis=1)
+    angles, alignments = frame_constants_of(chain, data)
+    end = {}
+    if layout.vertices:
+        (k,) = np.flatnonzero(data.stations == len(layout.tracked) - 1)
+        nodes = arm.stations.nodes[layout.tracked[-1]][data.station_order.reshape(-1, 3)[k]]
+        weight = chain.station_weights[-1]
+        end = {"end_station": int(k), "end_node": nodes, "end_weight": np.ascontiguousarray(weight)}
+    found = {
+        "node": chain.nodes,
+        "node_at": np.where(is_free, (chain.node_period + 1) * own + chain.node_place, 0),
+        "window": chain.window,
+        "entry": chain.entry,
+        "member": members,
+        "stroke_at": places[arm.actuators],
+        "held_at": places[chain.locked],
+        "moving_at": moving,
+        "is_fixed": fixed,
+        "base_entries": chain.entry[base_row, base_column],
+        "live": np.array(solver.elimination.live),
+        "tip_node": arm.end_effector.nodes,
+        "home": arm.home_quantities[members],
+        "aim": arm.home_quantities[members],
+        "fixed": fixed.astype(float),
+        "angles": angles,
+        "alignment": alignments,
+        "hard": hard.astype(float),
+        "weight": data.weights,
+        "slope": data.slopes,
+        "polygon": layout.vertex_hessian,
+        "along": layout.vertex_hessian + weights.tracking * data.weights.T @ data.weights,
+        "levers": layout.tip_levers,
+        "base_count": len(base_row),
+        "node_rate": weights.node_rate,
+        "actuator_weight": weights.actuators,
+        "tangent": weights.tangent,
+        "tracking": 0.0 if layout.hard_tracking else weights.tracking,
+        **end,
+    }
+    return {name: _for_c(value) for name, value in found.items()}
+
+
+def _for_c(value: Any) -> Any:
+    """Return an array of numbers, or of integers or marks, as C reads it."""
+    if not isinstance(value, np.ndarray):
+        return value
+    return np.array(value, dtype=float if value.dtype == np.float64 else np.int32, order="C")
+
+
+def _tolerances(layout: Layout) -> dict[str, Any]:
+    """Return by field the tolerances of the dense QP and of settling; those of the accuracy come later."""
+    arm = layout.arm
+    return {
+        "presses": PRESSES,
+        "accuracy": DAQP.accuracy,
+        "no_row": NO_ROW,
+        "dependent": DEPENDENT,
+        "independent": INDEPENDENT,
+        "at_bound": AT_BOUND * arm.fineness,
+        "left": LEFT * arm.fineness,
+        "worst_condition": WORST_CONDITION,
+        "too_far": TOO_FAR * arm.unit,
+        "closing_steps": MOST_STEPS,
+    }
+
+
+def _workspace(sizes: dict[str, int], functions: dict[str, ca.Function]) -> dict[str, Any]:
+    """Return by field the arrays of the sweeps."""
+    periods, own, moving, before = (sizes[name] for name in ("periods", "own", "moving", "before"))
+    columns, freedom, stations = sizes["curve"] + 1, sizes["freedom"], sizes["stations"]
+    follows, factor = bool(sizes["follows"]), functions["eliminate"]
+    carries, gains = (0, factor.nnz_out(0)) if follows else (factor.nnz_in(0), factor.nnz_out(1))
+    width = sizes["width"]
+    shapes: dict[str, tuple[int, ...]] = {
+        "gains": (periods, gains),
+        "lengths": (periods, own),
+        "factor": (columns - 1, columns - 1),
+        "rhs": (width,),
+        "free": (width,),
+        "shift": (sizes["vertices"], 3),
+        "displaced": (periods + 1, own),
+        "changed": (periods, own),
+        "parts": (periods, 5 * stations),
+        "nodal": (periods, own),
+        "force": (periods, moving),
+        "pushed": (periods, 5 * stations),
+        "settled": (periods, own),
+        "next": (periods, own),
+        "errors": (periods, own),
+        "wanted": (sizes["actuators"],),
+        "curve_aim": (periods, 3 * stations),
+        "work": (2 * carries + 4 * before + own + 3 * stations + freedom,),
+    }
+    if follows:
+        shapes |= {
+            "moved": (periods + 1, own, width),
+            "stroke_rows": (periods, moving, width),
+            "strokes": (periods, moving),
+            "angle_rows": (periods, 2 * stations, width),
+        }
+    else:
+        shapes |= {
+            "outer": (periods, freedom, width),
+            "placed": (periods, own),
+            "motions": (periods, freedom),
+            "passed": (periods, freedom, BLOCK),
+            "entering": (periods, own, BLOCK),
+            "gain": (sizes["actuators"], sizes["tips"]),
+            "gain_moved": (periods, own, sizes["tips"]),
+        }
+    return {name: np.zeros(shape) for name, shape in shapes.items()} | {
+        "carries": carries,
+        "gains_size": gains,
+    }
