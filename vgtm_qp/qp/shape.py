@@ -9,8 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from vgtm_qp.arrays import Array
+from vgtm_qp.compiled import Kernel
 from vgtm_qp.curve.curve import Curve
-from vgtm_qp.curve.families import CurveFamily
+from vgtm_qp.qp.curve_rows import CurvePlacing, curve_function, point_function
 
 
 class CurveRows(NamedTuple):
@@ -35,33 +36,8 @@ class CurveRows(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class CurveShape:
-    """How a curve's nodes are placed on it, and how much of its frame the stations track.
-
-    Attributes
-    ----------
-    family : CurveFamily
-    nodes : (K,)
-        Parameters s_k, or fractions of the arc length where `by_arc_length`.
-    by_arc_length : bool
-        Nodes keep their fractions of the arc length; s_k moves with the curve.
-    torsion : int
-        Number T of torsion coordinates.
-    roll : (K,)
-        Angle about the tangent from the curve's frame to the station at home, rad; kept if stations track roll.
-    tracks_roll : bool
-        Whether the third turn of a station is a row of the QP.
-    spacing : (S,)
-        Distances of successive nodes at home, the base first, m; S = K, or 0 without that objective.
-    """
-
-    family: CurveFamily
-    nodes: Array
-    by_arc_length: bool = False
-    torsion: int = 0
-    roll: Array | None = None
-    tracks_roll: bool = False
-    spacing: Array | None = None
+class CurveShape(CurvePlacing):
+    """The rows of a curve whose nodes are placed and tracked as :class:`CurvePlacing` says."""
 
     @property
     def is_plain(self) -> bool:
@@ -83,46 +59,46 @@ class CurveShape:
         """(K,) parameters of the tables of weights; nodes by arc length are located again on each curve."""
         return self.nodes
 
-    @cached_property
-    def _home_roll(self) -> Array:
-        roll = np.zeros(len(self.nodes)) if self.roll is None else self.roll
-        turn = np.zeros((len(roll), 3, 3))
-        turn[:, 0, 0] = turn[:, 1, 1] = np.cos(roll)
-        turn[:, 1, 0] = np.sin(roll)
-        turn[:, 0, 1] = -turn[:, 1, 0]
-        turn[:, 2, 2] = 1.0
-        return turn
-
     def at(self, vertices: Array, torsion: Array, base_frame: Array) -> CurveRows:
         """Return positions and frames alone, with zeros for all else; see :meth:`rows`."""
-        curve, s = self._nodes_of(vertices, torsion, base_frame)
-        nothing = np.zeros((len(s), 3, curve.coordinates))
-        spacing = np.zeros(self.spacings), np.zeros((self.spacings, curve.coordinates))
-        return CurveRows(curve.position(s), nothing, self._frame(curve, s), nothing, *spacing)
-
-    def _nodes_of(self, vertices: Array, torsion: Array, base_frame: Array) -> tuple[Curve, Array]:
-        """Return the curve, and the parameters (K,) of its nodes."""
-        curve = Curve(self.family, vertices, torsion, base_frame)
-        return curve, curve.arc_parameter(self.nodes) if self.by_arc_length else self.nodes
-
-    def _frame(self, curve: Curve, s: Array) -> Array:
-        """Return (K, 3, 3) the frames that stations track; without roll only the tangents, in the third column."""
-        if self.tracks_roll:
-            return curve.frame(s) @ self._home_roll
-        frame = np.zeros((len(s), 3, 3))
-        frame[:, :, 2] = curve.tangent(s)
-        return frame
+        found = _evaluated(self._points, vertices, torsion, base_frame)
+        if found is None:
+            curve, s = self._nodes_of(vertices, torsion, base_frame)
+            position, frame = curve.position(s), self._frame(curve, s)
+        else:
+            position, frame = (array.reshape(len(self.nodes), 3, -1) for array in found)
+        count, size = len(self.nodes), vertices.size + torsion.size
+        nothing = np.zeros((count, 3, size))
+        spacing = np.zeros(self.spacings), np.zeros((self.spacings, size))
+        return CurveRows(position.reshape(count, 3), nothing, frame, nothing, *spacing)
 
     def rows(self, vertices: Array, torsion: Array, base_frame: Array) -> CurveRows:
         """Return the rows at control vertices (V, 3), torsion (T,), with the frame (3, 3) of the base face.
-
-        Nodes by arc length move along the curve when it changes: x_dot = J_s p_dot + x' s_dot; the paper's eq. (35)
-        has the first term alone.
 
         Raises
         ------
         CurveError
             The curve has no tangent or no frame somewhere.
+        """
+        found = _evaluated(self._rows, vertices, torsion, base_frame)
+        if found is None:
+            return self.rows_of_any(vertices, torsion, base_frame)
+        count, size = len(self.nodes), vertices.size + torsion.size
+        shapes = (count, 3), (count, 3, size), (count, 3, 3), (count, 3, size), (-1,), (self.spacings, size)
+        return CurveRows(*(array.reshape(shape) for array, shape in zip(found, shapes, strict=True)))
+
+    @cached_property
+    def _points(self) -> Kernel:
+        return point_function(self).kernel()
+
+    @cached_property
+    def _rows(self) -> Kernel:
+        return curve_function(self).kernel()
+
+    def rows_of_any(self, vertices: Array, torsion: Array, base_frame: Array) -> CurveRows:
+        """Return :meth:`rows` by the curve itself, in twenty times the time: also where it has nearly a cusp.
+
+        Nodes by arc length move along the curve when it changes, see ``Curve.arc_node_rates``.
         """
         curve, s = self._nodes_of(vertices, torsion, base_frame)
         position_rows, frame = curve.position_jacobian(s), self._frame(curve, s)
@@ -147,3 +123,35 @@ class CurveShape:
             spacing = distance - self.spacing
             spacing_rows = np.einsum("kc,kcd->kd", steps / distance[:, None], change)
         return CurveRows(position, position_rows, frame, spin_rows, spacing, spacing_rows)
+
+    @cached_property
+    def _home_roll(self) -> Array:
+        roll = np.zeros(len(self.nodes)) if self.roll is None else self.roll
+        turn = np.zeros((len(roll), 3, 3))
+        turn[:, 0, 0] = turn[:, 1, 1] = np.cos(roll)
+        turn[:, 1, 0] = np.sin(roll)
+        turn[:, 0, 1] = -turn[:, 1, 0]
+        turn[:, 2, 2] = 1.0
+        return turn
+
+    def _nodes_of(self, vertices: Array, torsion: Array, base_frame: Array) -> tuple[Curve, Array]:
+        """Return the curve, and the parameters (K,) of its nodes."""
+        curve = Curve(self.family, vertices, torsion, base_frame)
+        return curve, curve.arc_parameter(self.nodes) if self.by_arc_length else self.nodes
+
+    def _frame(self, curve: Curve, s: Array) -> Array:
+        """Return (K, 3, 3) the frames that stations track; without roll only the tangents, in the third column."""
+        if self.tracks_roll:
+            return curve.frame(s) @ self._home_roll
+        frame = np.zeros((len(s), 3, 3))
+        frame[:, :, 2] = curve.tangent(s)
+        return frame
+
+
+def _evaluated(kernel: Kernel, vertices: Array, torsion: Array, base_frame: Array) -> list[Array] | None:
+    """Return copies of a kernel's results but the last, which says whether they are right; None where it denies it."""
+    for argument, values in zip(kernel.inputs, (vertices, torsion, base_frame.T), strict=False):
+        argument[:] = values.reshape(-1)
+    kernel()
+    *found, sound = kernel.outputs
+    return [array.copy() for array in found] if sound[0] else None
