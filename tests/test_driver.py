@@ -8,6 +8,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
+from arms import arm_problem
 from recorded_states import CASES
 from steps import drives_nothing, solved
 
@@ -69,7 +70,17 @@ def goals(resolver: vq.Resolver, rng: np.random.Generator, count: int) -> Iterat
 def assert_same(one: vq.Step, other: vq.Step, tolerance: float) -> None:
     assert one.status == other.status
     assert one.progress == pytest.approx(other.progress, abs=1e3 * tolerance)
-    for name in ("time", "q", "nodes", "control_vertices", "quantities", "motion", "duration", "late"):
+    for name in (
+        "time",
+        "q",
+        "nodes",
+        "control_vertices",
+        "torsion",
+        "quantities",
+        "motion",
+        "duration",
+        "late",
+    ):
         np.testing.assert_allclose(
             getattr(one.state, name), getattr(other.state, name), rtol=0.0, atol=tolerance, err_msg=name
         )
@@ -111,6 +122,86 @@ def test_it_takes_the_steps_of_serial_arms(name, driven, rng):
     assert any(driven)
 
 
+POSE = ["position", "pointing", "orientation"]
+CURVES = [
+    ("octahedral", 4, {"nodes": "arc-length"}, {}),
+    ("hexapod", 3, {"torsion_vertices": 1}, {}),
+    (
+        "hexapod",
+        3,
+        {"nodes": "arc-length", "torsion_vertices": 2},
+        {"weights": {"spacing": 0.4, "roll": 0.2}},
+    ),
+    ("longeron", 4, {"family": "b-spline", "torsion_vertices": 1}, {"weights": {"spacing": 1.0}}),
+    (
+        "double-octahedral",
+        3,
+        {"family": "beta-spline", "bias": 1.2, "nodes": "arc-length"},
+        {"hard": ["position"]},
+    ),
+    ("tetrahedral", 3, {"torsion_vertices": 1}, {"hard": POSE}),
+    ("hexapod", 3, {"family": "b-spline"}, {"hard": POSE}),
+    ("hexapod", 3, {"nodes": "arc-length"}, {"hard": ["position", "pointing"]}),
+    ("octahedral", 4, {"nodes": "arc-length"}, {"goals": True}),
+]
+
+
+@pytest.mark.parametrize("solver", ["daqp", "piqp"])
+@pytest.mark.parametrize(("module", "bays", "curve", "method"), CURVES, ids=str)
+def test_it_takes_the_steps_on_curves_that_tables_do_not_describe(
+    module, bays, curve, method, solver, driven, rng
+):
+    method, curve = {"solver": solver, **method}, {"control_vertices": 5, **curve}
+    hard = method.pop("hard", None)
+    method |= {"tracking_mode": "hard", "hard_coordinates": hard} if hard else {"tracking_mode": "elastic"}
+    if method.pop("goals", False):
+        curve["control_vertex_goals"] = [{"index": 3, "position": [0.4, 0.1, 1.8]}]
+    truss = {"module": module, "stroke": None}
+    problem = arm_problem((0.5, 0.2, 2.5), bays=bays, truss=truss, curve=curve, method=method)
+    assert vq.Resolver(problem).setup.layout.general is not None
+    driven.clear()
+    compare(problem, rng, 10, (100.0 if solver == "piqp" else 1.0) * SAME)
+    assert any(driven)
+
+
+def test_it_takes_the_steps_of_a_serial_arm_on_a_curve_with_torsion(driven, rng):
+    problem = vq.load_problem("snake_past_a_cube").replace(
+        {"curve.torsion_vertices": 1, "curve.nodes": "arc-length"}
+    )
+    compare(problem, rng, 10, SAME)
+    assert any(driven)
+
+
+@pytest.mark.parametrize("name", ["hexapod_past_a_cube", "beta_spline_past_a_cube"])
+def test_most_steps_on_such_curves_are_usual(name, driven):
+    maneuver = vq.solve(vq.load_problem(name))
+    assert maneuver.certificate.ok
+    assert np.mean(driven) > 0.7
+
+
+def test_a_curve_with_nearly_a_cusp_is_left_to_attempts(driven):
+    """Its control vertices are set by hand: the compiled code denies what it finds, and the steps are right."""
+    problem = arm_problem(
+        bays=4, curve={"control_vertices": 5, "nodes": "arc-length"}, method={"tracking_mode": "elastic"}
+    )
+    one, other = vq.Resolver(problem), without(problem)
+    vertices = one.state.control_vertices.copy()
+    vertices[:, 2] = vertices[0, 2] + (vertices[4, 2] - vertices[0, 2]) * np.array(
+        [0.0, 0.75, 0.5, 0.25, 1.0]
+    )
+    vertices[3, 0] += 1e-3
+    for resolver in (one, other):
+        resolver.state = replace(resolver.state, control_vertices=vertices)
+    driven.clear()
+    goal = one.tip()[0] + np.array([0.01, 0.0, -0.01])
+    found, expected = one.step(position=goal), other.step(position=goal)
+    assert found.moved
+    assert driven
+    assert not any(driven)
+    assert found.qps == expected.qps
+    np.testing.assert_allclose(found.state.q, expected.state.q, atol=1e-9)
+
+
 @pytest.mark.parametrize("number", range(12))
 def test_it_takes_the_steps_of_random_arms(number, driven, rng):
     seed = int(rng.integers(2**31))
@@ -142,6 +233,14 @@ FURTHER = {
     "offset joints, elastic": ("offset_joints_past_a_cube", {"method.tracking_mode": "elastic"}),
     "serial": ("snake_past_a_cube", {}),
     "serial, pressed": ("twelve_joints_past_a_crate", {}),
+    "torsion": ("hexapod_past_a_cube", {}),
+    "torsion, elastic": ("hexapod_past_a_cube", {"method.tracking_mode": "elastic"}),
+    "arc length": ("beta_spline_past_a_cube", {}),
+    "arc length, elastic": ("beta_spline_past_a_cube", {"method.tracking_mode": "elastic"}),
+    "arc length and torsion, serial": (
+        "snake_past_a_cube",
+        {"curve.torsion_vertices": 1, "curve.nodes": "arc-length"},
+    ),
 }
 """Problems by name, and their changes."""
 
@@ -201,7 +300,16 @@ def on_a_moving_base(problem: vq.Problem, rng: np.random.Generator) -> vq.Proble
     return problem.replace({f"{table}.base_motion": poses})
 
 
-@pytest.mark.parametrize("name", ["five_bay_two_cubes", "snake_past_a_cube", "twelve_joints_past_a_crate"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "five_bay_two_cubes",
+        "snake_past_a_cube",
+        "twelve_joints_past_a_crate",
+        "hexapod_past_a_cube",
+        "beta_spline_past_a_cube",
+    ],
+)
 def test_it_takes_the_steps_of_arms_on_moving_bases(name, driven, rng):
     compare(on_a_moving_base(vq.load_problem(name), rng), rng, 10, SAME)
     assert any(driven)

@@ -130,6 +130,40 @@ def test_both_engines_give_one_answer_on_every_curve(name, shape, family, rng):
         assert np.any(wanted.torsion) == bool(layout.torsion)
 
 
+@pytest.mark.parametrize("hard", [False, True])
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize(("name", "family"), [("hexapod", "bezier"), ("longeron", "beta-spline")])
+def test_both_engines_go_to_one_place_on_every_curve(name, family, shape, hard):
+    """One asks the compiled functions of the curve while it settles, the other one the curve's shape, from Python."""
+    layout, kinematics, *_ = engines(name, track=("position",), shape=shape, family=family)
+    layout = replace(layout, hard_tracking=hard)
+    arm = layout.arm
+    plain, fused = general(layout, kinematics, None), fused_engine(layout, kinematics, None)
+    kinematics.evaluate(arm.home)
+    lengths, here = kinematics.quantities[arm.actuators].copy(), arm.end_effector.position(arm.home)
+    path = Path(
+        np.array([0.0, 1.0]), here + np.outer([0.0, 1.0], [0.02, 0.01, -0.015]), np.stack([np.eye(3)] * 2)
+    )
+    target = Target(path, 0.0, 1.0, lengths - 0.3, lengths + 0.3, 1.0, 1.0)
+    centres = arm.stations.centres(arm.home)[[0, -1]]
+    vertices = np.linspace(0, 1, layout.vertices)[:, None] * (centres[1] - centres[0]) + centres[0]
+    vertices[2] += [0.01, -0.02, 0.005]
+    torsion = np.linspace(0.1, 0.05, layout.torsion)
+    asked = QPInput(arm.home, arm.home, vertices, torsion, target, path.at(0.0), 0.0, ClearanceRows(), True)
+    moves = [engine.move(asked, Accuracy(1e-10, 1e-8, 1e-1), lambda _: None) for engine in (fused, plain)]
+    one, other = moves
+    assert one.closed is not None
+    assert np.abs(one.closed.q - arm.home).max() > 0.01
+    np.testing.assert_allclose(one.closed.q, other.closed.q, atol=2e-8)
+    np.testing.assert_allclose(one.vertices, other.vertices, atol=1e-7)
+    np.testing.assert_allclose(one.torsion, other.torsion, atol=1e-7)
+    assert bool(layout.torsion) == bool(np.abs(one.torsion - torsion).max(initial=0.0) > 1e-6)
+    points = layout.shape.at(one.vertices, one.torsion, arm.stations.frames[0]).position
+    off = np.abs(arm.stations.centres(one.closed.q)[layout.tracked] - points).max(axis=1)
+    assert off[-1] < 1e-8
+    assert (off.max() < 1e-8) == hard
+
+
 @pytest.mark.parametrize("name", ["octahedral", "longeron"])
 def test_both_engines_hold_faces_on_the_curve_where_these_determine_the_nodes(name):
     layout, task = make_layout(TRUSSES[name](), vertices=5, hard_tracking=True)

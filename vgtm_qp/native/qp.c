@@ -24,6 +24,10 @@ typedef struct {
     /* (StepGraph.inputs) -> results of row_function; (q, lower, upper) -> (closer q, quantities, errors);
        (StepGraph.inputs, gone) -> results of missing_function. */
     Kernel condense, close, missing;
+    /* (vertices, torsion, base frame) -> a curve that constant tables do not describe, with its rows, and its nodes alone,
+       among the arguments of those; without eval where tables do. Whether the results are right: 1, else 0. */
+    Kernel curve, curve_nodes;
+    const double *curve_is_right, *nodes_are_right;
     void (*quadprog)(DAQPResult *, DAQPProblem *, DAQPSettings *);
     void (*defaults)(DAQPSettings *);
     /* Another solver instead, or null: it sets x, multipliers and iterations, and returns a code as above. */
@@ -47,7 +51,8 @@ typedef struct {
 
     /* Nodes of the tip; of S tracked stations nodes and weights (S, 3), turns R of each, and weights (S, V) of place and
        slope of their points on the curve; weights of the rows of gaps, turns and stretches (L), 1 where they are hard.
-       Rows (3 S, D) of the points and of the stretches over a curve that such weights do not describe, else null. */
+       Rows (3 S, D) of the points and of the stretches over a curve that such weights describe only at its end, else
+       null. */
     int tip_nodes, stations, turned, spacings;
     const int *tip_node, *station_node;
     const double *station_weight, *curve_weight, *curve_slope, *row_weight;
@@ -80,8 +85,8 @@ typedef struct {
     double *gone;                              /* (1) */
     const double *progress, *velocity, *spin;  /* (1), (3), (3) */
     const double *closer, *errors, *missed;
-    double *torsions;                          /* (T) changes */
-    double *started, *started_points;          /* q and the curve before they were settled */
+    double *torsions;                          /* (T) */
+    double *started, *started_points, *started_torsions;   /* q and the curve before they were settled */
 
     /* Tolerances of quantities and equalities, greatest error at the start, and errors at which the iterations end. */
     double member, tip, start, enough_length, enough_tip;
@@ -451,6 +456,7 @@ static void residuals(Fused *f, int rows)
 /* Condense the QP, but for its rows of clearance, at the state that was loaded. */
 EXPORT int assemble(Fused *f)
 {
+    if (f->curve.eval && (call(&f->curve) || *f->curve_is_right != 1.0)) return NO_VALUE;
     if (call(&f->condense)) return NO_VALUE;
     compose(f);
     objective(f);
@@ -687,6 +693,7 @@ EXPORT int settle(Fused *f)
         if (!is_closed) memcpy(f->q, f->closer, sizeof(double) * f->coordinates);
         else if (is_measured) break;
         if (error > f->small_error) continue;
+        if (f->curve_nodes.eval && (call(&f->curve_nodes) || *f->nodes_are_right != 1.0)) return NO_VALUE;
         if (call(&f->missing)) return UNSETTLED;
         f->off = 0.0;
         for (int k = 0; k < m; k++) f->off += f->levers[k] * f->missed[k] * f->levers[k] * f->missed[k];
@@ -727,10 +734,11 @@ static int depart(Fused *f, const double *q, double tolerance)
     *f->gone = reached - before;
     memcpy(f->q, q, sizeof(double) * f->coordinates);
     memcpy(f->points, f->condense.arg[3], sizeof(double) * 3 * f->vertices);
-    memset(f->torsions, 0, sizeof(double) * f->torsion);
+    if (f->torsion) memcpy(f->torsions, f->curve.arg[1], sizeof(double) * f->torsion);
     advance(f, f->x, 1);
     memcpy(f->started, f->q, sizeof(double) * f->coordinates);
     memcpy(f->started_points, f->points, sizeof(double) * 3 * f->vertices);
+    memcpy(f->started_torsions, f->torsions, sizeof(double) * f->torsion);
     double furthest = f->furthest;
     int code = settle(f);
     /* Not that of the last correction, which may have failed. */

@@ -34,6 +34,7 @@ typedef struct {
     /* Whether the curve ends at the tip, and along its z-axis, and whether stations must be on it; the gain (V, 1 or 2)
        from the errors of place and slope at its end; the base's normal (3). */
     int ends_at_tip, ends_along_tip, must_track;
+    int slides;                            /* whether the places on the curve are not where constant tables have them */
     const double *end_gain, *base_normal;
 
     /* Clearances, the margin of their rows, the distance of pairs that are far, share and least of a pair's approach;
@@ -398,6 +399,19 @@ static int reverses(const StepData *s)
     return first < 0.0 || (s->ends_along_tip && last < 0.0);
 }
 
+/* Find the places of the stations on the next curve, where constant tables do not give them. */
+static int find_places(StepData *s)
+{
+    Fused *f = s->fused;
+    size_t size = sizeof(double) * 3 * f->vertices;
+    if (!s->slides) return DONE;
+    memcpy(f->work, f->points, size);
+    memcpy(f->points, s->next_vertices, size);
+    int code = call(&f->curve_nodes);
+    memcpy(f->points, f->work, size);
+    return code || *f->nodes_are_right != 1.0 ? NO_VALUE : DONE;
+}
+
 /* The greatest distance of a station from its place on the curve; NaN stays. */
 static double greatest_gap(const StepData *s)
 {
@@ -409,7 +423,9 @@ static double greatest_gap(const StepData *s)
             double off = 0.0;
             for (int i = 0; i < 3; i++)
                 off += f->station_weight[3 * k + i] * s->next_nodes[3 * f->station_node[3 * k + i] + a];
-            for (int v = 0; v < f->vertices; v++) off -= f->curve_weight[k * f->vertices + v] * s->next_vertices[3 * v + a];
+            if (s->slides) off -= f->curve_nodes.res[0][3 * k + a];
+            for (int v = 0; v < f->vertices && !s->slides; v++)
+                off -= f->curve_weight[k * f->vertices + v] * s->next_vertices[3 * v + a];
             square += off * off;
         }
         if (square > worst || square != square) worst = square;
@@ -531,6 +547,7 @@ static int arrive(StepData *s)
     if (!is_flawless(s)) return FLAWED;
     end_curve(s);
     if (reverses(s)) return FLAWED;
+    if (find_places(s)) return NO_VALUE;
     s->gap = greatest_gap(s);
     if (s->must_track && !(s->gap <= s->tracking)) return OFF_CURVE;
     for (int i = 0; i < f->coordinates; i++) s->next_motion[i] = s->next_q[i] - s->q[i];
@@ -608,6 +625,10 @@ EXPORT int correct(StepData *s)
     memcpy(arg[1], q, sizeof(double) * f->coordinates);
     memcpy(arg[2], s->next_nodes, sizeof(double) * s->width);
     memcpy(arg[3], s->settled ? f->points : f->started_points, sizeof(double) * 3 * f->vertices);
+    if (f->torsion) {
+        const double *torsions = s->settled ? f->torsions : f->started_torsions;
+        memcpy((double *)f->curve.arg[1], torsions, sizeof(double) * f->torsion);
+    }
     for (int a = 0; a < 3; a++) arg[8][a] += *f->gone * f->velocity[a];
     if (s->turns) {
         double goal[9];

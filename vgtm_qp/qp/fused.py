@@ -22,6 +22,7 @@ from vgtm_qp.compiled import Kernel
 from vgtm_qp.errors import EvaluationError
 from vgtm_qp.native import Code, Program, building
 from vgtm_qp.qp.answer import Accuracy, Closed, CurvePoint, Move, Settled, StepSolution
+from vgtm_qp.qp.curve_rows import curve_function, point_function
 from vgtm_qp.qp.daqp import DAQP
 from vgtm_qp.qp.dense import EQUALITY, DenseSolver
 from vgtm_qp.qp.fused_rows import RESULTS, row_function
@@ -36,13 +37,10 @@ from vgtm_qp.qp.settle import (
     SETTLING_STEPS,
     TOO_FAR,
     WORST_CONDITION,
-    Gain,
     closing_function,
     enough_length,
     enough_tip_error,
-    held,
     missing_function,
-    settling_gain,
 )
 from vgtm_qp.qp.shape import CurveRows
 from vgtm_qp.rows.tip import TipGoal
@@ -75,8 +73,7 @@ def daqp_addresses() -> dict[str, int]:
 class FusedSolver:
     """Linearises, condenses, solves and settles; for arms whose symbols ``can_eliminate``.
 
-    ``settle`` and ``move`` are for curves of constant tables; other curves have rows that only Python can
-    compute. Solvers that differ only in their goals of control vertices share one workspace.
+    Solvers that differ only in their goals of control vertices share one workspace.
 
     The dense QPs are for `solver`, which C calls back unless it is DAQP.
     """
@@ -111,13 +108,20 @@ class FusedSolver:
 
     @property
     def kernels(self) -> tuple[Kernel, ...]:
-        """What the C calls: the functions of the rows, of what settling misses, and of the closing."""
+        """What the C calls: the functions of the rows, of what settling misses, of the closing, and of the curve."""
         return self.workspace.kernels
 
     def load(self, asked: StepInput) -> None:
         """Set the state, the goal and the boxes of the next QP."""
         self.draw(asked.vertices, asked.vertex_goals if asked.motion else None)
         asked.load(self.workspace.condense)
+        self.bend(asked.torsion, asked.base_frame)
+
+    def bend(self, torsion: Array, base_frame: Array) -> None:
+        """Set the torsion (T,) and the frame (3, 3) at the base of the curve in the next QP."""
+        if self.workspace.curve is not None:
+            _, given, base, *_ = self.workspace.curve.inputs
+            given[:], base[:] = torsion, base_frame.T.reshape(-1)
 
     def draw(self, vertices: Array, goals: Array | None) -> None:
         """Draw control vertices, which are at `vertices` (V, 3), to the layout's `goals` (V, 3), m, in the next QP."""
@@ -142,11 +146,10 @@ class FusedSolver:
         refuse_large(work.data.primal, work.data.dual, work.status)
         return self._whole(work.x, near)
 
-    def move(self, clearance: ClearanceRows, torsion: Array) -> Move:
+    def move(self, clearance: ClearanceRows) -> Move:
         """Solve the QP at the state loaded last, and return where its answer leads.
 
-        The solution's ``nodes`` and ``vertices`` are empty. `torsion` (T,) is the curve's before the step,
-        rad.
+        The solution's ``nodes`` and ``vertices`` are empty.
 
         Raises
         ------
@@ -158,14 +161,14 @@ class FusedSolver:
         code = work.check(work.call("move", TOLERANCE))
         if code == Code.INACCURATE:
             refuse_large(data.primal, data.dual, work.status)
-        return self.led(torsion, is_settled=code == Code.DONE)
+        return self.led(is_settled=code == Code.DONE)
 
-    def led(self, torsion: Array, *, is_settled: bool) -> Move:
+    def led(self, *, is_settled: bool) -> Move:
         """Return where the answer of the QP solved last led; see :meth:`move`."""
         work, solution = self.workspace, self.answered()
         points = work.points if is_settled else work.started_points
+        torsion = (work.torsions if is_settled else work.started_torsions).copy()
         q, vertices = work.started.reshape(work.shape).copy(), points.reshape(-1, 3).copy()
-        torsion = torsion + solution.torsion if len(torsion) else torsion
         closed = work.closed() if is_settled else None
         return Move(solution, q, vertices, torsion, work.data.reached, work.data.furthest, closed)
 
@@ -174,32 +177,25 @@ class FusedSolver:
     ) -> Settled | None:
         """Return the configuration near `q`, quantities closed and the tip at `goal`, and the curve near `curve`.
 
-        Actuators are in their boxes (n_a,). None if the iteration does not converge.
+        Actuators are in their boxes (n_a,). None if the iteration does not converge; EvaluationError where the nodes of
+        the curve can only be had from the curve itself.
         """
         work, inputs = self.workspace, self.workspace.condense.inputs
         work.q[:], work.points[:] = q.reshape(-1), curve.vertices.reshape(-1)
+        work.torsions[:] = curve.torsion
         inputs[4][:], inputs[5][:] = lower, upper
         inputs[8][:], inputs[9][:] = goal.position, goal.rotation.T.reshape(-1)
         work.gone[0] = 0.0
-        if work.call("settle") != Code.DONE:
+        if work.check(work.call("settle")) != Code.DONE:
             return None
-        return Settled(work.closed(), CurvePoint(work.points.reshape(-1, 3).copy(), curve.torsion))
+        return Settled(work.closed(), CurvePoint(work.points.reshape(-1, 3).copy(), work.torsions.copy()))
 
-    def gain(self) -> Gain | None:
-        """See ``CondensedSolver.gain_of``; for the QP solved last."""
-        work, count = self.workspace, self.workspace.actuators
-        free = np.ones(work.size, dtype=bool)
-        free[:count] = ~held(work.x[:count], work.lower[:count], work.upper[:count], self.layout.arm.fineness)
-        free[-1] = False
-        gain = settling_gain(work.hessian, work.constraint[: work.equal], self.layout.levers, free)
-        return None if gain is None else Gain(gain, lambda x: self._whole(x, 0, moves=False))
-
-    def _whole(self, x: Array, near: int, *, moves: bool = True) -> StepSolution:
-        """Return the solution of the unknowns `x`; without the motions by residuals unless it `moves`."""
-        work, layout, constant = self.workspace, self.layout, float(moves)
+    def _whole(self, x: Array, near: int) -> StepSolution:
+        """Return the solution of the unknowns `x`."""
+        work, layout = self.workspace, self.layout
         count, nodes = work.actuators, np.zeros((len(layout.arm.node_names), 3))
-        nodes[layout.arm.free] = work.displacement(x, constant)
-        vertices = constant * work.offset
+        nodes[layout.arm.free] = work.displacement(x)
+        vertices = work.offset.copy()
         if layout.vertices:
             vertices[1] += work.normal * x[count]
             vertices[2:] += x[count + 1 : work.torsion].reshape(-1, 3)
@@ -241,6 +237,10 @@ class FusedWorkspace:
         self.condense = row_function(layout).kernel(compiled=compiled)
         self.missing = missing_function(layout).kernel(compiled=compiled)
         self.close = closing_function(layout).kernel(compiled=compiled)
+        self.curve = self.curve_nodes = None
+        if (shape := layout.general) is not None:
+            self.curve = curve_function(shape).kernel(compiled=compiled)
+            self.curve_nodes = point_function(shape).kernel(compiled=compiled)
         self.actuators, self.equal = len(arm.actuators), equal
         self.size, self.first_near = self.actuators + layout.free_curve + 1, equal + len(layout.legs)
         self.torsion, self.shape = self.size - 1 - layout.torsion, arm.home_configuration.shape
@@ -270,7 +270,8 @@ class FusedWorkspace:
     @property
     def kernels(self) -> tuple[Kernel, ...]:
         """See :class:`FusedSolver`."""
-        return self.condense, self.missing, self.close
+        of_curve = (kernel for kernel in (self.curve, self.curve_nodes) if kernel is not None)
+        return self.condense, self.missing, self.close, *of_curve
 
     @property
     def data(self) -> Any:
@@ -340,17 +341,17 @@ class FusedWorkspace:
                 enough_tip=enough_tip_error(home, accuracy.tip),
             )
 
-    def displacement(self, x: Array, constant: float) -> Array:
-        """Return (N - N_c, 3) displacements of the free nodes by `x`, and `constant` times the known ones, m."""
+    def displacement(self, x: Array) -> Array:
+        """Return (N - N_c, 3) displacements of the free nodes by `x` and by residuals, m."""
         count = self.actuators
         if self._movers is None:
-            moved = self._response[:, 1:] @ x[:count] + constant * self._response[:, 0]
+            moved = self._response[:, 1:] @ x[:count] + self._response[:, 0]
             return np.asarray(moved.reshape(-1, 3))
         twists, places = self._moving[0].reshape(-1, 6), self._moving[1].reshape(-1, 3)
         known = self._moved.reshape(-1, 3)[self._layout.arm.free]
         summed = np.concatenate([np.zeros((1, 6)), np.cumsum(x[:count, None] * twists, axis=0)])
         summed = summed[self._movers]
-        return np.asarray(np.cross(summed[:, :3], places) + summed[:, 3:] + constant * known)
+        return np.asarray(np.cross(summed[:, :3], places) + summed[:, 3:] + known)
 
     def take(self, clearance: ClearanceRows) -> int:
         """Give the rows of clearance to the QP, and return their number."""
@@ -398,6 +399,7 @@ class FusedWorkspace:
             close.bind_input(argument, shared)
         self.q, self.points, self.gone = missing.inputs[0], missing.inputs[3], missing.inputs[common]
         self.started, self.started_points = self.q.copy(), self.points.copy()
+        self.torsions, self.started_torsions = np.zeros(layout.torsion), np.zeros(layout.torsion)
         size, nodes = self.size, layout.node_columns
         rows = layout.least_squares - (0 if self._movers is None else nodes)
         self.hessian, self.gradient, self.x = np.zeros((size, size)), np.zeros(size), np.zeros(size)
@@ -438,9 +440,10 @@ class FusedWorkspace:
             closer=close.outputs[0],
             errors=close.outputs[2],
             missed=missing.outputs[0],
-            torsions=np.zeros(layout.torsion),
+            torsions=self.torsions,
             started=self.started,
             started_points=self.started_points,
+            started_torsions=self.started_torsions,
             work=np.zeros(work),
             working=self._working(size).address,
             at=np.zeros(size, dtype=np.int32),
@@ -450,7 +453,27 @@ class FusedWorkspace:
         if self.solver is not DAQP:
             self._callback = ctypes.CFUNCTYPE(ctypes.c_int)(self._ask)
             self._program.set(other=ctypes.cast(self._callback, ctypes.c_void_p).value)
+        if self.curve is not None:
+            self._bend(self.curve)
         self._reserve(_ROOM, _SLOTS)
+
+    def _bend(self, curve: Kernel) -> None:
+        """Let the functions of the curve write among the arguments of the others, and give them to C."""
+        nodes, inputs = self.curve_nodes, self.condense.inputs[12:]
+        assert nodes is not None
+        curve.bind_input(0, self.condense.inputs[3])
+        for argument, shared in enumerate((self.points, self.torsions, curve.inputs[2])):
+            nodes.bind_input(argument, shared)
+        for result, field in enumerate(CurveRows._fields):
+            curve.bind_output(result, inputs[result])
+            if field in ("position", "frame"):
+                nodes.bind_output(int(field == "frame"), inputs[result])
+        self._program.set(
+            curve=curve,
+            curve_is_right=curve.outputs[-1],
+            curve_nodes=nodes,
+            nodes_are_right=nodes.outputs[-1],
+        )
 
     def _working(self, size: int) -> Program:
         """Return the C's working set of QPs of that size."""
@@ -551,7 +574,7 @@ def _composition(layout: Layout, condense: Kernel) -> dict[str, Any]:
     }
     if layout.general is not None:
         points, rows = (12 + CurveRows._fields.index(name) for name in ("position_rows", "spacing_rows"))
-        curve = {"point_rows": condense.inputs[points], "stretch_rows": condense.inputs[rows]}
+        curve |= {"point_rows": condense.inputs[points], "stretch_rows": condense.inputs[rows]}
     return {
         "tip_nodes": len(tip.nodes),
         "tip_node": tip.nodes.astype(np.int32),

@@ -38,6 +38,8 @@ class StepInput(NamedTuple):
     curve : CurveRows or None
         Rows of a curve that constant tables do not describe.
     vertex_goals : (V, 3) or None
+    torsion, base_frame : (T,), (3, 3)
+        From which compiled code computes such rows.
     """
 
     q: Array
@@ -51,6 +53,8 @@ class StepInput(NamedTuple):
     goal: TipGoal
     curve: CurveRows | None = None
     vertex_goals: Array | None = None
+    torsion: Array = np.zeros(0)
+    base_frame: Array = np.eye(3)
 
     def load(self, kernel: Kernel) -> None:
         """Write the arguments of a function of ``StepGraph.inputs``."""

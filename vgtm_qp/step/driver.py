@@ -16,6 +16,7 @@ import numpy as np
 
 from vgtm_qp.arm.arm import Arm, Ends, Pose, tip_function
 from vgtm_qp.arrays import Array, record
+from vgtm_qp.errors import CurveError
 from vgtm_qp.geometry.exact import CONTACT, NORMAL_FROM, PROOF
 from vgtm_qp.geometry.groups import Scene
 from vgtm_qp.geometry.pairs import Pair
@@ -128,7 +129,7 @@ Taken = Passage | Begun | Lost | Denied
 def can_drive(setup: Setup) -> bool:
     """Return whether usual steps of an arm can be taken in one call, if its ``Arm.arithmetic`` is known."""
     layout = setup.layout
-    is_plain = layout.general is None and layout.own is None
+    is_plain = layout.own is None
     without_limits = setup.minimum_angle == 0.0 and setup.step_limit == np.inf
     return is_plain and without_limits
 
@@ -200,7 +201,7 @@ class Driver:
         if code == Code.DONE:
             return self._passage(state, target)
         if code in _AGAIN or code == Code.NOT_PROVEN:
-            first = self._solver.led(state.torsion, is_settled=bool(data.settled))
+            first = self._solver.led(is_settled=bool(data.settled))
             return self.corrected(state, target, Begun(first, first, self._rows(), data.reach), code)
         return _denied(state, target, share, self._rows()) if code == Code.INFEASIBLE else None
 
@@ -243,11 +244,12 @@ class Driver:
         """Return what is left to an attempt after QPs of which the last ended with `code`: a proof, or that QP."""
         first, work = begun.first, self._work
         if code == Code.NOT_PROVEN:
-            move = self._solver.led(first.torsion, is_settled=True)
+            move = self._solver.led(is_settled=True)
         else:
             # Where the QP before it led, as far as this one knows.
             q, vertices, progress = (work.condense.inputs[k].copy() for k in (0, 3, 7))
-            at = q.reshape(work.shape), vertices.reshape(-1, 3), first.torsion
+            torsion = first.torsion if work.curve is None else work.curve.inputs[1].copy()
+            at = q.reshape(work.shape), vertices.reshape(-1, 3), torsion
             move, qps = Move(first.solution, *at, float(progress[0]), 0.0, None), qps - 1
         begun = begun._replace(move=move, reach=self._program.data.reach, qps=qps, covered=covered)
         return _corrects_nothing(target, begun, self._rows()) if code == Code.INFEASIBLE else begun
@@ -257,6 +259,7 @@ class Driver:
         work, inputs = self._work, self._work.condense.inputs
         goal = target.goal(1.0).over(target.end - target.start)
         work.started[:], work.started_points[:] = first.q.reshape(-1), first.vertices.reshape(-1)
+        work.started_torsions[:] = first.torsion
         inputs[8][:], inputs[10][:] = goal.position, goal.velocity
         if self._setup.task.turns is not None:
             inputs[9].reshape(3, 3)[:], inputs[11][:] = goal.rotation.T, goal.spin
@@ -267,6 +270,8 @@ class Driver:
         data, inputs, monitor = self._program.data, self._work.condense.inputs, self._setup.monitor
         goal = target.goal(0.0).over(target.end - target.start)
         self._solver.draw(state.control_vertices, target.vertex_goals)
+        if self._layout.general is not None:
+            self._solver.bend(state.torsion, base_frame(self._setup.arm, target.base))
         self._solver.aim(self._accuracy)
         inputs[4][:], inputs[5][:] = target.lower, target.upper
         inputs[8][:], inputs[10][:] = goal.position, goal.velocity
@@ -305,8 +310,9 @@ class Driver:
         q, nodes, vertices, values, motion, rates, tip = (block[part] for part in self._parts)
         q, nodes = q.reshape(work.shape), nodes.reshape(-1, 3)
         vertices, progress, gap = vertices.reshape(-1, 3), work.data.reached, data.gap
+        torsion = work.torsions.copy() if layout.torsion else state.torsion
         if layout.hard_turns:
-            gap = self._setup.gap(q, vertices, state.torsion, target.base)
+            gap = _gap(self._setup, q, vertices, torsion, target.base)
             if layout.hard_tracking and not gap <= self._accuracy.tracking:
                 return None
         time, late = state.after(target.duration)
@@ -316,7 +322,7 @@ class Driver:
             q=q,
             nodes=q if self._is_placed else nodes,
             control_vertices=vertices,
-            torsion=state.torsion,
+            torsion=torsion,
             quantities=values,
             rates=rates,
             motion=motion.reshape(q.shape),
@@ -480,6 +486,14 @@ def _corrects_nothing(target: Target, begun: Begun, rows: ClearanceRows) -> Deni
     return Denied(asked, begun.qps + 1, begun.first.solution, begun.rows)
 
 
+def _gap(setup: Setup, q: Array, vertices: Array, torsion: Array, base: Pose | None) -> float:
+    """Return the greatest gap or turn of a configuration, see ``Gap``; NaN if its curve has no frame somewhere."""
+    try:
+        return setup.gap(q, vertices, torsion, base)
+    except CurveError:
+        return np.nan
+
+
 def _of_curve(layout: Layout) -> dict[str, object]:
     """Return by field what the C knows of the curve beside its rows."""
     if not len(layout.tracked):
@@ -488,6 +502,7 @@ def _of_curve(layout: Layout) -> dict[str, object]:
         "ends_at_tip": int(layout.ends_at_tip),
         "ends_along_tip": int(layout.ends_along_tip),
         "must_track": int(layout.hard_tracking and not layout.hard_turns),
+        "slides": int(layout.general is not None and layout.general.by_arc_length),
         "end_gain": np.ascontiguousarray(layout.end_gain),
     }
 

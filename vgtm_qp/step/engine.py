@@ -309,7 +309,6 @@ class FusedEngine(Engine):
         super().__init__(layout)
         self._kinematics, self._task = kinematics, task
         self.solver = solver
-        self._last: QPInput | None = None
 
     @cached_property
     def _plain(self) -> GeneralEngine:
@@ -328,7 +327,7 @@ class FusedEngine(Engine):
     def move(self, asked: QPInput, accuracy: Accuracy, spent: Spent) -> Move:
         """See :class:`Engine`; one compiled call also settles the answer, if it applies.
 
-        It does not apply if the path turns within the step, the base moves, or the curve's rows are computed in Python.
+        It does not apply if the path turns within the step, or the base moves.
         """
         if not self.solver.is_ready:
             return self._plain.move(asked, accuracy, spent)
@@ -343,11 +342,11 @@ class FusedEngine(Engine):
         target, solver = asked.target, self.solver
         solver.aim(accuracy)
         is_straight = target.base is None and target.path.is_straight(target.start, target.end)
-        if not is_straight or self.layout.general is not None:
+        if not is_straight:
             return super().move(asked, accuracy, spent)
         try:
-            solver.load(asked.linear(self.layout))
-            return solver.move(asked.rows, asked.torsion)
+            solver.load(asked.linear(self.layout, nodes=False))
+            return solver.move(asked.rows)
         except InfeasibleStepError:
             # The general move may find an answer without the margin.
             return super().move(asked, accuracy, spent)
@@ -356,16 +355,12 @@ class FusedEngine(Engine):
 
     def solve(self, asked: QPInput) -> StepSolution:
         """See :class:`Engine`."""
-        self.solver.load(asked.linear(self.layout))
-        self._last = asked
+        self.solver.load(asked.linear(self.layout, nodes=False))
         return self.solver.solve(asked.rows)
 
     def settle(
         self, q: Array, curve: CurvePoint, target: Target, goal: TipGoal, accuracy: Accuracy
     ) -> Settled | None:
         """See :class:`Engine`."""
-        if self.layout.general is None:
-            self.solver.aim(accuracy)
-            return self.solver.settle(q, curve, target.lower, target.upper, goal)
-        assert self._last is not None
-        return self._plain.equalities.settle(q, curve, self._last, goal, accuracy, self.solver.gain)
+        self.solver.aim(accuracy)
+        return self.solver.settle(q, curve, target.lower, target.upper, goal)

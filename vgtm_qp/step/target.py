@@ -75,17 +75,21 @@ class QPInput(NamedTuple):
     rows: ClearanceRows
     motion: bool
 
-    def linear(self, layout: Layout, *, rows: bool = True) -> StepInput:
-        """Return this input for a QP of `layout`; without `rows`, the rows of a general curve are zeros."""
+    def linear(self, layout: Layout, *, rows: bool = True, nodes: bool = True) -> StepInput:
+        """Return this input for a QP of `layout`; without `rows`, the rows of a general curve are zeros.
+
+        Without its `nodes` too, it has none of them: compiled code computes both.
+        """
         arm, target, shape, curve = layout.arm, self.target, layout.general, None
-        if shape is not None:
-            at = self.vertices, self.torsion, base_frame(arm, target.base)
+        begin = base_frame(arm, target.base) if len(arm.stations) else np.eye(3)
+        if shape is not None and nodes:
+            at = self.vertices, self.torsion, begin
             curve = shape.rows(*at) if rows else shape.at(*at)
-        nodes = arm.nodes(self.q)
+        places = arm.nodes(self.q)
         return StepInput(
             q=self.q,
             at=self.at,
-            base=nodes if target.base is None else arm.nodes(arm.based(self.q, target.base)),
+            base=places if target.base is None else arm.nodes(arm.based(self.q, target.base)),
             vertices=self.vertices,
             lower=target.lower,
             upper=target.upper,
@@ -94,6 +98,8 @@ class QPInput(NamedTuple):
             goal=self.goal.over(target.end - target.start),
             curve=curve,
             vertex_goals=target.vertex_goals,
+            torsion=self.torsion,
+            base_frame=begin,
         )
 
 
