@@ -20,13 +20,9 @@ from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.acceptance import Acceptance
 from vgtm_qp.step.actuation import Actuation
 from vgtm_qp.step.driver import (
-    DEVIATION,
     FREE_QPS,
-    LEAP,
     MOST_QPS,
-    MOTION_MARGIN,
     PHASES,
-    SINGULAR,
     Begun,
     Denied,
     Driver,
@@ -39,6 +35,7 @@ from vgtm_qp.step.separation import RECOVERY, Separation
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import Shortfall, State
 from vgtm_qp.step.step import WHOLE, Step, StepStatus
+from vgtm_qp.step.step_data import DEVIATION, LEAP, MOTION_MARGIN, SINGULAR
 from vgtm_qp.step.target import QPInput, Target, base_frame
 
 _MOST_FRACTIONS = 8

@@ -8,44 +8,26 @@ between two states. Each further QP is one more call. See ``native/step.c``.
 from __future__ import annotations
 
 from collections.abc import Callable
-from itertools import pairwise
 from time import perf_counter
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from vgtm_qp.arm.arm import Arm, Ends, Pose, tip_function
+from vgtm_qp.arm.arm import Arithmetic, Pose
 from vgtm_qp.arrays import Array, record
 from vgtm_qp.errors import CurveError
-from vgtm_qp.geometry.exact import CONTACT, NORMAL_FROM, PROOF
-from vgtm_qp.geometry.groups import Scene
 from vgtm_qp.geometry.pairs import Pair
-from vgtm_qp.geometry.watch import AHEAD, Watch
-from vgtm_qp.native import Code, Program
+from vgtm_qp.geometry.watch import Watch
+from vgtm_qp.native import Code
 from vgtm_qp.qp.answer import Accuracy, Move, StepSolution
-from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.numbers import ClearanceRows
-from vgtm_qp.qp.residual import TOLERANCE
-from vgtm_qp.rows.tip import axes
-from vgtm_qp.step.acceptance import LOOSER, ROUNDING
 from vgtm_qp.step.engine import FusedEngine
-from vgtm_qp.step.separation import MOST_PIECES, Separation
+from vgtm_qp.step.separation import Separation
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import State
 from vgtm_qp.step.step import WHOLE
+from vgtm_qp.step.step_data import StepData
 from vgtm_qp.step.target import QPInput, Target, base_frame
-
-MOTION_MARGIN = 2.5
-"""Ratio of the displacement for which pairs are listed to the expected displacement of a node."""
-
-SINGULAR = 1e3
-"""Displacement of a node, over the arm's length, above which a QP's answer shows a singular pose."""
-
-LEAP = 1.0
-"""Greatest displacement of a control vertex's coordinate in one step, over the arm's length."""
-
-DEVIATION = 0.1
-"""Greatest deviation of points from their chords in one step, over the arm's length."""
 
 FREE_QPS = 3
 """Greatest number of QPs with free progress along the piece of path."""
@@ -66,9 +48,6 @@ PHASES = "distance", "qp", "acceptance"
 """Parts of a step whose times are known."""
 
 _NO_ROWS = ClearanceRows()
-
-_ROOM, _SLOTS = 64, 4
-"""Capacity at first: rows of clearance; points of a row."""
 
 
 class Passage(NamedTuple):
@@ -148,17 +127,17 @@ class Driver:
         Seconds spent so far in the :data:`PHASES`; may be set to zero.
     """
 
+    _arrays: StepData
+
     def __init__(self, setup: Setup, engine: FusedEngine, accuracy: Accuracy, separation: Separation) -> None:
         self._setup, self._accuracy, self._separation = setup, accuracy, separation
         self._solver, self._layout = engine.solver, engine.layout
         self._work, self._known = self._solver.workspace, setup.arm.arithmetic()
-        self._ends = None if self._known is None else self._known.ends
-        self._points: Array | None = None
+        self._started = False
         self._held: State | None = None
         self._watch: Watch | None = None
         self.spent = np.zeros(len(PHASES))
         self._moves = setup.base_motion is not None
-        self._started = self._is_placed = False
 
     def take(self, state: State, target: Target, share: float) -> Taken | None:
         """Return the step from `state`, in which no pair is too near, to the end of the target's piece of path.
@@ -179,25 +158,24 @@ class Driver:
         if watch is None and monitor.scene.has_pairs:
             return None
         if not self._started:
-            self._start()
-        data = self._program.data
-        self._program.refresh()
+            self._start(self._known)
+        arrays, data = self._arrays, self._arrays.data
+        arrays.program.refresh()
         work.refresh()
         self._load(state, target, share)
         if watch is None:
             data.way = 0
         else:
-            at = state.nodes if self._points is None else self._points
+            at = state.nodes if arrays.points is None else arrays.points
             data.way = watch.started(at, state.time).address
             watch.refresh()
-        code = self._called(self._take)
+        code = self._called(self._arrays.take)
         if not code:
             return self._passage(state, target)
         if code == Code.ELSEWHERE:
             assert watch is not None
-            at = state.nodes if self._points is None else self._points
             data.way = watch.move_to(at, state.time, data.limit, data.self_limit).address
-            code = self._called(self._take)
+            code = self._called(self._arrays.take)
         if code == Code.DONE:
             return self._passage(state, target)
         if code in _AGAIN or code == Code.NOT_PROVEN:
@@ -205,15 +183,21 @@ class Driver:
             return self.corrected(state, target, Begun(first, first, self._rows(), data.reach), code)
         return _denied(state, target, share, self._rows()) if code == Code.INFEASIBLE else None
 
+    def _start(self, known: Arithmetic) -> None:
+        """Allocate what the call needs."""
+        pace = {**self._separation.pace, "spent": self.spent}
+        self._arrays = StepData(self._setup, self._layout, self._work, known, self._accuracy, **pace)
+        self._started = True
+
     def _called(self, call: Callable[[], int]) -> int:
         """Return how a QP ended that a `call` solves, where what it asks for is answered, and there is enough room."""
-        code, data = call(), self._program.data
+        code, data = call(), self._arrays.data
         while code and code in _WANTING:
             if code == Code.ASKS:
                 self._ask()
-                code = self._resume()
+                code = self._arrays.resume()
             else:
-                self._make_room(2 * data.room)
+                self._arrays.make_room(2 * data.room)
                 code = call()
         if data.asked_for and (not code or code in _AGAIN):
             fcl = self._setup.monitor.scene.fcl
@@ -231,7 +215,7 @@ class Driver:
                 covered = first.progress
                 self._cut(target.part(covered), first)
             self._solver.draw(state.control_vertices, None)
-            code = self._called(self._correct)
+            code = self._called(self._arrays.correct)
             found = self._passage(state, target) if code == Code.DONE else None
             if found is not None:
                 progress = covered * found.progress
@@ -251,7 +235,7 @@ class Driver:
             torsion = first.torsion if work.curve is None else work.curve.inputs[1].copy()
             at = q.reshape(work.shape), vertices.reshape(-1, 3), torsion
             move, qps = Move(first.solution, *at, float(progress[0]), 0.0, None), qps - 1
-        begun = begun._replace(move=move, reach=self._program.data.reach, qps=qps, covered=covered)
+        begun = begun._replace(move=move, reach=self._arrays.data.reach, qps=qps, covered=covered)
         return _corrects_nothing(target, begun, self._rows()) if code == Code.INFEASIBLE else begun
 
     def _cut(self, target: Target, first: Move) -> None:
@@ -263,11 +247,11 @@ class Driver:
         inputs[8][:], inputs[10][:] = goal.position, goal.velocity
         if self._setup.task.turns is not None:
             inputs[9].reshape(3, 3)[:], inputs[11][:] = goal.rotation.T, goal.spin
-        work.gone[0], work.data.reached, self._program.data.settled = 0.0, 1.0, 0
+        work.gone[0], work.data.reached, self._arrays.data.settled = 0.0, 1.0, 0
 
     def _load(self, state: State, target: Target, share: float) -> None:
         """Write the step's state, goal and boxes."""
-        data, inputs, monitor = self._program.data, self._work.condense.inputs, self._setup.monitor
+        data, inputs, monitor = self._arrays.data, self._work.condense.inputs, self._setup.monitor
         goal = target.goal(0.0).over(target.end - target.start)
         self._solver.draw(state.control_vertices, target.vertex_goals)
         if self._layout.general is not None:
@@ -280,9 +264,7 @@ class Driver:
         if state is not self._held:
             # What ends the writing half way must not leave a mixture that passes for a state.
             self._held = None
-            arrays = state.q, state.nodes, state.control_vertices, state.quantities, state.motion
-            for part, values in zip(self._parts, arrays, strict=False):
-                self._before[part] = values.reshape(-1)
+            self._arrays.load(state)
             self._held = state
         if target.base is not None:
             self._move_base(state, target.base)
@@ -298,16 +280,16 @@ class Driver:
         """Write where the base is at the end of the step."""
         arm = self._setup.arm
         based = arm.based(state.q, pose)
-        self._based_q[:], self._based_nodes[:] = based.reshape(-1), arm.nodes(based).reshape(-1)
+        self._arrays.based_q[:], self._arrays.based_nodes[:] = based.reshape(-1), arm.nodes(based).reshape(-1)
         if len(self._layout.tracked):
-            self._base_normal[:] = base_frame(arm, pose)[:, 2]
+            self._arrays.base_normal[:] = base_frame(arm, pose)[:, 2]
 
     def _passage(self, state: State, target: Target) -> Passage | None:
         """Return the step that the call took; None where what it did not check itself does not hold."""
-        data, work, layout = self._program.data, self._work, self._layout
-        block = self._after.copy()
+        data, work, layout = self._arrays.data, self._work, self._layout
+        block = self._arrays.after.copy()
         block.setflags(write=False)
-        q, nodes, vertices, values, motion, rates, tip = (block[part] for part in self._parts)
+        q, nodes, vertices, values, motion, rates, tip = (block[part] for part in self._arrays.parts)
         q, nodes = q.reshape(work.shape), nodes.reshape(-1, 3)
         vertices, progress, gap = vertices.reshape(-1, 3), work.data.reached, data.gap
         torsion = work.torsions.copy() if layout.torsion else state.torsion
@@ -320,7 +302,7 @@ class Driver:
             State,
             time=time,
             q=q,
-            nodes=q if self._is_placed else nodes,
+            nodes=q if self._arrays.is_placed else nodes,
             control_vertices=vertices,
             torsion=torsion,
             quantities=values,
@@ -332,7 +314,7 @@ class Driver:
             tip=Pose(tip[:3], tip[3:].reshape(3, 3)),
         )
         self._held = None
-        self._before[:] = block[: len(self._before)]
+        self._arrays.before[:] = block[: len(self._arrays.before)]
         self._held = then
         return Passage(
             then, progress, gap if layout.tracked.size else np.nan, self._solver.answered(), self._rows()
@@ -343,11 +325,11 @@ class Driver:
         began, watch, fcl = perf_counter(), self._watch, self._setup.monitor.scene.fcl
         assert watch is not None
         assert fcl is not None
-        asked = self._asked[: self._work.data.near] == self._program.data.round
+        asked = self._arrays.asked[: self._work.data.near] == self._arrays.data.round
         for k in asked.nonzero()[0].tolist():
-            group = watch.groups[self._group[k]].group
-            piece = None if group.is_self else int(group.other[self._pair[k]])
-            fcl.answer(self._questions[k], piece, self._program.data.at_time, self._answers[k])
+            group = watch.groups[self._arrays.group[k]].group
+            piece = None if group.is_self else int(group.other[self._arrays.pair[k]])
+            fcl.answer(self._arrays.questions[k], piece, self._arrays.data.at_time, self._arrays.answers[k])
         self.spent[0] += perf_counter() - began
 
     def _rows(self) -> ClearanceRows:
@@ -356,118 +338,16 @@ class Driver:
         if not near or self._watch is None:
             return _NO_ROWS
         names, groups = self._setup.monitor.names, [pairs.group for pairs in self._watch.groups]
-        group, pair = self._group[:near].copy(), self._pair[:near].copy()
+        group, pair = self._arrays.group[:near].copy(), self._arrays.pair[:near].copy()
 
         def name(k: int) -> str:
             of, row = groups[group[k]], pair[k]
             return names.clearance(Pair(int(of.body[row]), int(of.other[row]), of.is_self))
 
-        data = self._program.data
+        data = self._arrays.data
         return ClearanceRows(
             *work.near(near), name, data.proven, (data.asked_for if data.asks else near) - data.proven
         )
-
-    def _make_room(self, rows: int) -> None:
-        """Make room for that many rows of clearance."""
-        self._work.reserve(rows, _SLOTS if self._ends is None else 3 * _SLOTS)
-        self._contacts, self._questions, self._answers = (np.zeros((rows, n)) for n in (CONTACT, 12, 7))
-        self._group, self._pair, self._asked = (np.zeros(rows, dtype=np.int32) for _ in range(3))
-        self._program.set(
-            contacts=self._contacts,
-            questions=self._questions,
-            answers=self._answers,
-            group=self._group,
-            pair=self._pair,
-            asked=self._asked,
-            room=rows,
-        )
-
-    def _start(self) -> None:
-        """Allocate the arrays of the call, and set what stays the same."""
-        setup, layout, arm, work = self._setup, self._layout, self._setup.arm, self._work
-        self._program = program = Program("StepData")
-        sizes = {
-            "q": arm.home_configuration.size,
-            "nodes": arm.home.size,
-            "vertices": 3 * layout.vertices,
-            "values": len(arm.quantity_names),
-            "motion": arm.home_configuration.size,
-            "rates": len(arm.quantity_names),
-            "tip": 12,
-        }
-        ends = np.cumsum([0, *sizes.values()]).tolist()
-        self._parts = [slice(first, last) for first, last in pairwise(ends)]
-        self._before, self._after = np.zeros(ends[5]), np.zeros(ends[-1])
-        for name, part in zip(sizes, self._parts, strict=True):
-            if part.stop <= len(self._before):
-                program.set(**{name: self._before[part]})
-            program.set(**{f"next_{name}": self._after[part]})
-        self._nodes = self._before[self._parts[1]].reshape(-1, 3)
-        self._based_q, self._based_nodes = (self._before[part] for part in self._parts[:2])
-        if self._moves:
-            self._based_q, self._based_nodes = self._based_q.copy(), self._based_nodes.copy()
-        self._base_normal = np.zeros(3)
-        if len(layout.tracked):
-            self._base_normal[:] = base_frame(arm, None)[:, 2]
-        self._make_room(_ROOM)
-        known, tip = self._known, arm.end_effector
-        assert known is not None
-        self._is_placed = known.place is None
-        if known.place is not None:
-            program.set(place=known.place)
-        if known.bend is not None:
-            program.set(bend=known.bend)
-        if known.levers is not None:
-            program.set(levers=known.levers)
-        if setup.task.turns is not None:
-            program.set(frame=tip_function(arm).kernel())
-        points: dict[str, Any] = {
-            "points": self._before[self._parts[1]],
-            "next_points": self._after[self._parts[1]],
-        }
-        points |= _of_points(arm, self._ends)
-        self._points = None if self._ends is None else points["points"]
-        self._take, self._resume, self._correct = map(program.entry, ("take", "resume", "correct"))
-        program.set(
-            fused=work.address,
-            width=arm.home.size,
-            quantities=len(arm.quantity_names),
-            based=len(known.based),
-            base=known.based.astype(np.int32),
-            moves=int(self._moves),
-            based_q=self._based_q,
-            based_nodes=self._based_nodes,
-            base_normal=self._base_normal,
-            distances=int(known.distances),
-            first=known.first.astype(np.int32),
-            last=known.last.astype(np.int32),
-            multiplier=known.multiplier,
-            axes=len(axes(layout.tip_rows)),
-            axis=np.array(axes(layout.tip_rows), dtype=np.int32),
-            turns=len(layout.tip_rows) - len(axes(layout.tip_rows)),
-            unit=arm.unit,
-            deviation=DEVIATION * arm.height,
-            actuator=arm.actuators.astype(np.int32),
-            home=arm.home_quantities,
-            tip_weight=np.ascontiguousarray(tip.weights, dtype=float),
-            influence=setup.influence,
-            margin=setup.margin,
-            **_of_fcl(setup.monitor.scene),
-            motion_margin=MOTION_MARGIN,
-            ahead=AHEAD,
-            furthest=SINGULAR * arm.height,
-            leap=LEAP * arm.height,
-            member=LOOSER * self._accuracy.member,
-            tip=LOOSER * self._accuracy.tip,
-            tracking=self._accuracy.tracking,
-            relative=ROUNDING,
-            tolerance=TOLERANCE,
-            spent=self.spent,
-            **self._separation.pace,
-            **_of_curve(layout),
-            **points,
-        )
-        self._started = True
 
 
 def _denied(state: State, target: Target, share: float, rows: ClearanceRows) -> Denied | None:
@@ -492,50 +372,3 @@ def _gap(setup: Setup, q: Array, vertices: Array, torsion: Array, base: Pose | N
         return setup.gap(q, vertices, torsion, base)
     except CurveError:
         return np.nan
-
-
-def _of_curve(layout: Layout) -> dict[str, object]:
-    """Return by field what the C knows of the curve beside its rows."""
-    if not len(layout.tracked):
-        return {}
-    return {
-        "ends_at_tip": int(layout.ends_at_tip),
-        "ends_along_tip": int(layout.ends_along_tip),
-        "must_track": int(layout.hard_tracking and not layout.hard_turns),
-        "slides": int(layout.general is not None and layout.general.by_arc_length),
-        "end_gain": np.ascontiguousarray(layout.end_gain),
-    }
-
-
-def _of_fcl(scene: Scene) -> dict[str, float]:
-    """Return by field what the C knows of FCL."""
-    if scene.fcl is None:
-        return {"asks": 0}
-    return {
-        "asks": 1,
-        "scale": scene.fcl.scale,
-        "flaw": PROOF * scene.unit,
-        "apart": NORMAL_FROM * scene.unit,
-    }
-
-
-def _of_points(arm: Arm, ends: Ends | None) -> dict[str, object]:
-    """Return by field what the C knows of the points of the bodies, where these are not the nodes."""
-    home = arm.points(arm.home_configuration)
-    found: dict[str, object] = {
-        "places": np.zeros((MOST_PIECES + 1, *home.shape)),
-        "span": home.size,
-        "slots": _SLOTS,
-    }
-    if ends is None:
-        return found
-    # The points at home are the first place of the watch; the C writes those of each state.
-    return found | {
-        "points": home.copy(),
-        "next_points": home.copy(),
-        "spread": ends.place,
-        "end": ends.row,
-        "end_nodes": np.ascontiguousarray(ends.nodes, dtype=np.int32),
-        "offset": np.ascontiguousarray(ends.offset),
-        "slots": 3 * _SLOTS,
-    }

@@ -1,0 +1,237 @@
+"""The arrays and numbers by which Python and ``native/step.c`` know of one arm's step."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from vgtm_qp.arm.arm import Arithmetic, Arm, Ends, tip_function
+from vgtm_qp.arrays import Array
+from vgtm_qp.geometry.exact import CONTACT, NORMAL_FROM, PROOF
+from vgtm_qp.geometry.groups import Scene
+from vgtm_qp.geometry.watch import AHEAD
+from vgtm_qp.native import Program
+from vgtm_qp.qp.answer import Accuracy
+from vgtm_qp.qp.fused import FusedWorkspace
+from vgtm_qp.qp.layout import Layout
+from vgtm_qp.qp.residual import TOLERANCE
+from vgtm_qp.rows.tip import axes
+from vgtm_qp.step.acceptance import LOOSER, ROUNDING
+from vgtm_qp.step.separation import MOST_PIECES
+from vgtm_qp.step.setup import Setup
+from vgtm_qp.step.state import State
+from vgtm_qp.step.target import base_frame
+
+MOTION_MARGIN = 2.5
+"""Ratio of the displacement for which pairs are listed to the expected displacement of a node."""
+
+SINGULAR = 1e3
+"""Displacement of a node, over the arm's length, above which a QP's answer shows a singular pose."""
+
+LEAP = 1.0
+"""Greatest displacement of a control vertex's coordinate in one step, over the arm's length."""
+
+DEVIATION = 0.1
+"""Greatest deviation of points from their chords in one step, over the arm's length."""
+
+_ROOM, _SLOTS = 64, 4
+"""Capacity at first: rows of clearance; points of a row."""
+
+
+class StepData:
+    """The structure of the C's step of one arm with one engine, and its arrays.
+
+    Attributes
+    ----------
+    program : Program
+        The structure, and the functions ``take``, ``resume`` and ``correct``.
+    data : ctypes.Structure
+        Its fields.
+    parts : list of slice
+        Configuration, nodes, control vertices, quantities, motion, rates and tip in `before` and `after`.
+    before, after : 1-D
+        The state, without rates and tip, and the next one.
+    based_q, based_nodes : 1-D
+        Configuration and nodes when the base alone has moved.
+    base_normal : (3,)
+        Where the base is at the end of the step.
+    points : (P, 3) or None
+        Of the bodies, m, where these are not the nodes.
+    is_placed : bool
+        Whether the configuration is the nodes.
+    contacts, questions, answers, group, pair, asked
+        One row for each of the rows of clearance; see ``step.c``.
+    """
+
+    def __init__(
+        self,
+        setup: Setup,
+        layout: Layout,
+        work: FusedWorkspace,
+        known: Arithmetic,
+        accuracy: Accuracy,
+        **given: Any,
+    ) -> None:
+        arm = setup.arm
+        self.program = Program("StepData")
+        self.data, self._work, self._ends = self.program.data, work, known.ends
+        self._hold_states(arm, layout)
+        self.based_q, self.based_nodes = (self.before[part] for part in self.parts[:2])
+        moves = setup.base_motion is not None
+        if moves:
+            self.based_q, self.based_nodes = self.based_q.copy(), self.based_nodes.copy()
+        self.base_normal = np.zeros(3)
+        if len(layout.tracked):
+            self.base_normal[:] = base_frame(arm, None)[:, 2]
+        self.make_room(_ROOM)
+        self.is_placed = known.place is None
+        kernels = {"place": known.place, "bend": known.bend, "levers": known.levers}
+        self.program.set(**{name: value for name, value in kernels.items() if value is not None})
+        if setup.task.turns is not None:
+            self.program.set(frame=tip_function(arm).kernel())
+        of_points = {"points": self.before[self.parts[1]], "next_points": self.after[self.parts[1]]}
+        of_points |= _of_points(arm, known.ends)
+        self.points: Array | None = None if known.ends is None else of_points["points"]
+        self.take, self.resume, self.correct = map(self.program.entry, ("take", "resume", "correct"))
+        self.program.set(
+            fused=work.address,
+            moves=int(moves),
+            based_q=self.based_q,
+            based_nodes=self.based_nodes,
+            base_normal=self.base_normal,
+            influence=setup.influence,
+            margin=setup.margin,
+            motion_margin=MOTION_MARGIN,
+            ahead=AHEAD,
+            relative=ROUNDING,
+            tolerance=TOLERANCE,
+            member=LOOSER * accuracy.member,
+            tip=LOOSER * accuracy.tip,
+            tracking=accuracy.tracking,
+            **_of_arm(arm, known),
+            **_of_tip(arm, layout),
+            **_of_fcl(setup.monitor.scene),
+            **_of_curve(layout),
+            **of_points,
+            **given,
+        )
+
+    def _hold_states(self, arm: Arm, layout: Layout) -> None:
+        """Allocate the state and the next one."""
+        sizes = {
+            "q": arm.home_configuration.size,
+            "nodes": arm.home.size,
+            "vertices": 3 * layout.vertices,
+            "values": len(arm.quantity_names),
+            "motion": arm.home_configuration.size,
+            "rates": len(arm.quantity_names),
+            "tip": 12,
+        }
+        ends = np.cumsum([0, *sizes.values()]).tolist()
+        self.parts = [slice(first, last) for first, last in pairwise(ends)]
+        self.before, self.after = np.zeros(ends[5]), np.zeros(ends[-1])
+        for name, part in zip(sizes, self.parts, strict=True):
+            if part.stop <= len(self.before):
+                self.program.set(**{name: self.before[part]})
+            self.program.set(**{f"next_{name}": self.after[part]})
+
+    def load(self, state: State) -> None:
+        """Write a state."""
+        arrays = state.q, state.nodes, state.control_vertices, state.quantities, state.motion
+        for part, values in zip(self.parts, arrays, strict=False):
+            self.before[part] = values.reshape(-1)
+
+    def make_room(self, rows: int) -> None:
+        """Make room for that many rows of clearance."""
+        self._work.reserve(rows, _SLOTS if self._ends is None else 3 * _SLOTS)
+        self.contacts, self.questions, self.answers = (np.zeros((rows, n)) for n in (CONTACT, 12, 7))
+        self.group, self.pair, self.asked = (np.zeros(rows, dtype=np.int32) for _ in range(3))
+        self.program.set(
+            contacts=self.contacts,
+            questions=self.questions,
+            answers=self.answers,
+            group=self.group,
+            pair=self.pair,
+            asked=self.asked,
+            room=rows,
+        )
+
+
+def _of_arm(arm: Arm, known: Arithmetic) -> dict[str, object]:
+    """Return by field what the C knows of an arm."""
+    return {
+        "width": arm.home.size,
+        "quantities": len(arm.quantity_names),
+        "based": len(known.based),
+        "base": known.based.astype(np.int32),
+        "distances": int(known.distances),
+        "first": known.first.astype(np.int32),
+        "last": known.last.astype(np.int32),
+        "multiplier": known.multiplier,
+        "unit": arm.unit,
+        "deviation": DEVIATION * arm.height,
+        "furthest": SINGULAR * arm.height,
+        "leap": LEAP * arm.height,
+        "actuator": arm.actuators.astype(np.int32),
+        "home": arm.home_quantities,
+    }
+
+
+def _of_tip(arm: Arm, layout: Layout) -> dict[str, object]:
+    """Return by field what the C knows of the tip beside its rows."""
+    along = axes(layout.tip_rows)
+    return {
+        "axes": len(along),
+        "axis": np.array(along, dtype=np.int32),
+        "turns": len(layout.tip_rows) - len(along),
+        "tip_weight": np.ascontiguousarray(arm.end_effector.weights, dtype=float),
+    }
+
+
+def _of_curve(layout: Layout) -> dict[str, object]:
+    """Return by field what the C knows of the curve beside its rows."""
+    if not len(layout.tracked):
+        return {}
+    return {
+        "ends_at_tip": int(layout.ends_at_tip),
+        "ends_along_tip": int(layout.ends_along_tip),
+        "must_track": int(layout.hard_tracking and not layout.hard_turns),
+        "slides": int(layout.general is not None and layout.general.by_arc_length),
+        "end_gain": np.ascontiguousarray(layout.end_gain),
+    }
+
+
+def _of_fcl(scene: Scene) -> dict[str, float]:
+    """Return by field what the C knows of FCL."""
+    if scene.fcl is None:
+        return {"asks": 0}
+    return {
+        "asks": 1,
+        "scale": scene.fcl.scale,
+        "flaw": PROOF * scene.unit,
+        "apart": NORMAL_FROM * scene.unit,
+    }
+
+
+def _of_points(arm: Arm, ends: Ends | None) -> dict[str, Any]:
+    """Return by field what the C knows of the points of the bodies, where these are not the nodes."""
+    home = arm.points(arm.home_configuration)
+    found: dict[str, Any] = {
+        "places": np.zeros((MOST_PIECES + 1, *home.shape)),
+        "span": home.size,
+        "slots": _SLOTS,
+    }
+    if ends is None:
+        return found
+    # The points at home are the first place of the watch; the C writes those of each state.
+    return found | {
+        "points": home.copy(),
+        "next_points": home.copy(),
+        "spread": ends.place,
+        "end": ends.row,
+        "end_nodes": np.ascontiguousarray(ends.nodes, dtype=np.int32),
+        "offset": np.ascontiguousarray(ends.offset),
+        "slots": 3 * _SLOTS,
+    }
