@@ -20,7 +20,6 @@ from vgtm_qp.arm.build import make_arm
 from vgtm_qp.arm.carrying import Carrier
 from vgtm_qp.arm.symbols import Constants
 from vgtm_qp.arrays import Array
-from vgtm_qp.compiled import compiler
 from vgtm_qp.curve.curve import Curve, straight_curve
 from vgtm_qp.curve.families import CurveFamily, make_family
 from vgtm_qp.errors import Mistake, PartError, nearest
@@ -292,14 +291,13 @@ def make_engine(
     if layout.elastic_tip and not is_short:
         _LOG.warning(_CONDENSED_ALL_THE_SAME)
     is_quick = not plain and not layout.elastic_tip and not layout.own
-    by_c = solver == DEFAULT_SOLVER and compiler() is not None
-    is_staged = is_quick and compiled and prefers_staged(layout, compiled=by_c)
-    along = chain_solver(layout, dense_solver(solver)) if is_staged else None
-    if along is not None and ChainEngine.serves(along):
-        return ChainEngine(along, kinematics, task)
     if is_quick and is_short and layout.arm.symbols(Constants()).can_eliminate:
         fused = FusedSolver(layout, dense_solver(solver), compiled=compiled)
         return FusedEngine(layout, kinematics, task, fused)
+    is_staged = is_quick and compiled and prefers_staged(layout)
+    along = chain_solver(layout, dense_solver(solver)) if is_staged else None
+    if along is not None and ChainEngine.serves(along):
+        return ChainEngine(along, kinematics, task)
     if layout.own:
         condensed = CondensedSolver(layout, dense_solver(solver))
         return GeneralEngine(layout, kinematics, task, condensed, compiled=compiled)

@@ -12,9 +12,6 @@ from vgtm_qp.qp.long.tracked import TrackedSolver
 STAGED_ACTUATORS = 70
 """Least number of actuators with which elimination along the chain is faster than condensing onto the actuators."""
 
-COMPILED_ACTUATORS = 50
-"""The same where both are calls of C."""
-
 
 def chain_solver(layout: Layout, solver: DenseSolver = DAQP) -> StagedSolver | TrackedSolver | None:
     """Return the solver along the chain of `layout`; None without a chain, or if chains cannot have its rows.
@@ -31,7 +28,9 @@ def chain_solver(layout: Layout, solver: DenseSolver = DAQP) -> StagedSolver | T
     return StagedSolver(chain, solver)
 
 
-def prefers_staged(layout: Layout, *, compiled: bool = False) -> bool:
-    """Whether a `chain_solver` for `layout`, if there is one, is faster than the condensed QP; `compiled`, if by C."""
-    least = COMPILED_ACTUATORS if compiled else STAGED_ACTUATORS
-    return len(layout.arm.actuators) >= least and layout.is_tabled
+def prefers_staged(layout: Layout) -> bool:
+    """Whether a `chain_solver` for `layout`, if there is one, is faster than the condensed QP.
+
+    A compiler makes no difference, for the two settle to different states.
+    """
+    return len(layout.arm.actuators) >= STAGED_ACTUATORS and layout.is_tabled
