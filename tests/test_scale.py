@@ -64,9 +64,7 @@ def test_a_larger_or_smaller_arm_moves_in_the_same_way(name, factor):
     first, second = (vq.solve(each) for each in (small, other))
     assert second.status == first.status
     assert len(second.time) == len(first.time)
-    # Settling compares changes of the torsion, in radians, with lengths; at the end of this path it hardly converges.
-    apart = 1e-3 if name == "hexapod_past_a_cube" else 1e-6
-    assert np.abs(second.nodes / factor - first.nodes).max() <= apart * unit
+    assert np.abs(second.nodes / factor - first.nodes).max() <= 1e-6 * unit
     assert second.reached == pytest.approx(first.reached, abs=1e-6)
     assert second.certificate.failures() == first.certificate.failures()
     stops = [each.manifest["stop"] or {} for each in (first, second)]

@@ -20,6 +20,7 @@ typedef struct {
     int settling_steps, closing_steps;
     double too_far, small_error;
     const double *levers;          /* (m) lengths to compare the equalities by */
+    double lever;                  /* m, to compare torsions with lengths by */
 
     /* (StepGraph.inputs) -> results of row_function; (q, lower, upper) -> (closer q, quantities, errors);
        (StepGraph.inputs, gone) -> results of missing_function. */
@@ -677,6 +678,14 @@ static void change_by(const Fused *f, const double *missing, double *change)
     for (int k = 0; k < f->held; k++) change[f->at[k]] = 0.0;
 }
 
+/* The product of two changes of the unknowns, whose torsions count as lengths. */
+static double measured(const Fused *f, const double *a, const double *b)
+{
+    int n = f->unknowns, T = f->torsion, first = n - 1 - T;
+    double product = dot(a, b, n);
+    return T ? product + (f->lever * f->lever - 1.0) * dot(a + first, b + first, T) : product;
+}
+
 /* Settle q and the curve: quantities exact, equalities satisfied. Each iteration closes the quantities by a step of
    Newton's method, and then corrects the equalities: closing again in between would not change what they miss. Steps (n)
    after the first have Broyden's updates of the gain, in the form that needs the steps alone. */
@@ -709,7 +718,7 @@ EXPORT int settle(Fused *f)
         change_by(f, f->missed, next);
         for (int k = 0; k < steps; k++) {
             const double *before = step + k * n;
-            double share = dot(before, next, n) / dot(before, before, n);
+            double share = measured(f, before, next) / measured(f, before, before);
             if (k < steps - 1)
                 for (int i = 0; i < n; i++) next[i] += share * before[n + i];
             else if (share < 1.0)

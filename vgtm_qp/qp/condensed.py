@@ -91,7 +91,9 @@ class CondensedSolver:
         rows = np.concatenate([(qp.A @ Z)[builder.tip_rows], Z[builder.hard_gaps]])
         gain = settling_gain(Z.T @ (qp.P @ Z), rows, self.layout.levers, free)
         nothing = np.zeros(len(qp.row_lower)), np.zeros(builder.size), 0
-        return None if gain is None else Gain(gain, lambda x: builder.solution(Z @ x, *nothing))
+        levers, end = np.ones(len(free)), len(at_bound) + self.layout.free_curve
+        levers[end - self.layout.torsion : end] = self.layout.arm.unit
+        return None if gain is None else Gain(gain, lambda x: builder.solution(Z @ x, *nothing), levers)
 
     def gain(self, held: NDArray[np.bool_]) -> Array | None:  # noqa: ARG002
         """See ``solvers.StepSolver``."""

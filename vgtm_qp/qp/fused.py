@@ -542,6 +542,7 @@ def _numbers(layout: Layout) -> dict[str, Any]:
         "at_bound": AT_BOUND * arm.fineness,
         "left": LEFT * arm.fineness,
         "levers": layout.levers,
+        "lever": arm.unit,
         "worst_condition": WORST_CONDITION,
         "settling_steps": SETTLING_STEPS,
         "closing_steps": MOST_STEPS,

@@ -97,15 +97,19 @@ def settling_gain(hessian: Array, rows: Array, levers: Array, free: NDArray[np.b
 
 
 class Gain(NamedTuple):
-    """The result (n, m) of :func:`settling_gain`, and the function from changes (n,) to their solution."""
+    """The result (n, m) of :func:`settling_gain`, and the function from changes (n,) to their solution.
+
+    The levers (n,), m or 1, are those by which changes are compared with one another.
+    """
 
     per_missing: Array
     solution: Callable[[Array], StepSolution]
+    levers: Array
 
     def updated(self, change: Array, less: Array) -> Gain:
         """Return Broyden's update after a `change` (n,) that reduced the errors by `less` (m,)."""
         gain = self.per_missing
-        along = change @ gain
+        along = (self.levers**2 * change) @ gain
         scale = along @ less
         if scale == 0.0:
             return self
