@@ -763,19 +763,11 @@ static int solve_dual(Chain *c, const double *value)
     for (int i = 0; i < rank; i++) identity[i * rank + i] = 1.0;
     for (int i = 0; i < K; i++) memcpy(compact + i * rank, rows + i * K, sizeof(double) * rank);
     DAQPProblem problem = {rank, K, 0, identity, gradient, compact, high, low, sense};
-    DAQPSettings settings;
-    DAQPResult result;
-    memset(&result, 0, sizeof(result));
-    c->defaults(&settings);
-    settings.primal_tol = c->accuracy;
-    settings.eps_prox = 0.0;
-    result.x = x;
-    result.lam = found;
-    c->quadprog(&result, &problem, &settings);
-    c->flag = result.exitflag;
-    c->iterations += result.iter;
-    if (result.exitflag == EXIT_INFEASIBLE) return INFEASIBLE;
-    if (result.exitflag <= 0) return FAILED;
+    int iterations;
+    c->flag = ask_daqp(c->quadprog, c->defaults, &problem, c->accuracy, x, found, &iterations);
+    c->iterations += iterations;
+    if (c->flag == EXIT_INFEASIBLE) return INFEASIBLE;
+    if (c->flag <= 0) return FAILED;
     for (int i = 0; i < K; i++) c->multiplier[c->kept[i]] = found[i] * scale[i];
     return DONE;
 }

@@ -553,6 +553,23 @@ static int guess(Fused *f, int rows)
     return 0;
 }
 
+/* Have DAQP write the answer of a problem to x and its multipliers; return its exit flag. */
+static int ask_daqp(void (*quadprog)(DAQPResult *, DAQPProblem *, DAQPSettings *), void (*defaults)(DAQPSettings *),
+                    DAQPProblem *problem, double accuracy, double *x, double *multipliers, int *iterations)
+{
+    DAQPSettings settings;
+    DAQPResult result;
+    memset(&result, 0, sizeof(result));
+    defaults(&settings);
+    settings.primal_tol = accuracy;
+    settings.eps_prox = 0.0;
+    result.x = x;
+    result.lam = multipliers;
+    quadprog(&result, problem, &settings);
+    *iterations = result.iter;
+    return result.exitflag;
+}
+
 /* Solve the QP that was assembled with its rows of clearance. */
 static int answer(Fused *f)
 {
@@ -566,18 +583,8 @@ static int answer(Fused *f)
     if (guess(f, rows)) return DONE;
     DAQPProblem problem = {f->unknowns, f->unknowns + rows, f->unknowns, f->hessian, f->gradient,
                            f->constraint, f->upper, f->lower, f->sense};
-    DAQPSettings settings;
-    DAQPResult result;
-    memset(&result, 0, sizeof(result));
-    f->defaults(&settings);
-    settings.primal_tol = f->feasibility;
-    settings.eps_prox = 0.0;
-    result.x = f->x;
-    result.lam = f->multipliers;
-    f->quadprog(&result, &problem, &settings);
-    f->flag = result.exitflag;
-    f->iterations = result.iter;
-    if (result.exitflag == EXIT_INFEASIBLE) return INFEASIBLE;
+    f->flag = ask_daqp(f->quadprog, f->defaults, &problem, f->feasibility, f->x, f->multipliers, &f->iterations);
+    if (f->flag == EXIT_INFEASIBLE) return INFEASIBLE;
     residuals(f, rows);
     return DONE;
 }
