@@ -115,6 +115,21 @@ def test_it_takes_the_steps_of_an_attempt(name, driven, rng):
     compare(problem, rng, 10, (100.0 if iterative else 1.0) * SAME)
 
 
+def test_it_takes_the_steps_of_an_attempt_beside_a_cylinder(driven):
+    """FCL's points of a rim turned with rounding: steps differed by 1e-8 m."""
+    problem = CASES["tetrahedral 4, far goal"].load()
+    one, other = vq.Resolver(problem), without(problem)
+    supplied = 0
+    for position in one.tip()[0] + np.linspace(0.0, 1.0, 40)[:, None] * [-0.2, 0.8, -1.1]:
+        other.state = one.state
+        found, expected = one.step(position=position), other.step(position=position)
+        if found.qps == expected.qps == 1:
+            supplied += found.fcl_rows
+            assert_same(found, expected, SAME)
+    assert supplied
+    assert any(driven)
+
+
 @pytest.mark.parametrize("name", ["snake_past_a_cube", "twelve_joints_past_a_crate"])
 def test_it_takes_the_steps_of_serial_arms(name, driven, rng):
     problem = vq.load_problem(name)

@@ -107,6 +107,18 @@ def test_every_row_agrees_with_the_closed_form_and_with_finite_differences(seed,
         assert row == pytest.approx((ahead - behind) / (2.0 * h), abs=5e-3)
 
 
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**31 - 1), st.sampled_from(SHAPES))
+def test_rows_do_not_turn_with_the_last_digits_of_an_iteration(seed, shape):
+    X, monitor = scene(shape, seed)
+    found, exact = near(monitor, X, by_fcl=True), near(monitor, X)
+    # The closer, the more rounding turns the normal.
+    rows = np.flatnonzero(found.by_fcl & (exact.distance > 0.02))
+    assert len(rows) or not (exact.distance > 0.02).any() or shape == "cylinder"
+    np.testing.assert_allclose(found.normal[rows], exact.normal[rows], rtol=0.0, atol=1e-11)
+    np.testing.assert_allclose(found.weights[rows], exact.weights[rows], rtol=0.0, atol=1e-11)
+
+
 def too_far(answers, monitor, X):
     answers[:, 0] += 0.1
 

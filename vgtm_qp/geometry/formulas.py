@@ -206,6 +206,45 @@ def _segment_sphere(ends: Any, piece: Any) -> tuple[SymbolicContact, SymbolicCon
     return contact, contact
 
 
+class _BesideCylinder:
+    """A segment in the frame of a solid cylinder with flat ends, and how its distance changes along it."""
+
+    def __init__(self, ends: Any, piece: Any) -> None:
+        self.a, self.b, self.turn = _in_frame(ends, piece)
+        self.radius, self.half, self.u = piece[12], piece[13], self.b - self.a
+
+    def excess(self, t: Any) -> Any:
+        """Return the vector (3,) from the cylinder to the segment at a parameter, zero inside."""
+        x = _blend(self.a, self.b, t)
+        rho = norm(x[:2])
+        return ca.vertcat(ratio(ca.fmax(rho - self.radius, 0.0), rho) * x[:2], _beyond(x[2], self.half))
+
+    def slope(self, t: Any) -> Any:
+        """Return half the derivative of the squared distance."""
+        return ca.dot(self.excess(t), self.u)
+
+    def newton(self, t: Any, otherwise: Any) -> Any:
+        """Return the parameter after a step of Newton's iteration; less by `otherwise` where there is no curvature."""
+        x, u = _blend(self.a, self.b, t), self.u
+        rho = norm(x[:2])
+        rate = ratio(ca.dot(x[:2], u[:2]), rho)
+        across = rate**2 + ratio(rho - self.radius, rho) * (ca.dot(u[:2], u[:2]) - rate**2)
+        curvature = ca.if_else(rho > self.radius, across, 0.0)
+        curvature += ca.if_else(ca.fabs(x[2]) > self.half, u[2] ** 2, 0.0)
+        return t - ratio(self.slope(t), curvature, otherwise)
+
+
+def nearest_of_cylinder(t: Any, ends: Any, piece: Any) -> tuple[Any, Any]:
+    """Return a parameter nearer to that of a segment's nearest point than `t`, which is near to it, and the gap there.
+
+    The gap is the vector (3,) from the piece, m. Two of Newton's steps have four times the digits of `t`.
+    """
+    beside = _BesideCylinder(ends, piece)
+    for _ in range(2):
+        t = clip(beside.newton(t, 0.0))
+    return t, beside.turn @ beside.excess(t)
+
+
 def _segment_cylinder(
     ends: Any, piece: Any, *, apart: bool = False
 ) -> tuple[SymbolicContact, SymbolicContact]:
@@ -214,17 +253,8 @@ def _segment_cylinder(
     The derivative is linear or of known sign everywhere but over the rim. There Newton's iteration runs
     inside a bracket, with bisection where it would leave the bracket.
     """
-    a, b, turn = _in_frame(ends, piece)
-    radius, half, u = piece[12], piece[13], b - a
-
-    def excess(t: Any) -> Any:
-        x = _blend(a, b, t)
-        rho = norm(x[:2])
-        return ca.vertcat(ratio(ca.fmax(rho - radius, 0.0), rho) * x[:2], _beyond(x[2], half))
-
-    def slope(t: Any) -> Any:
-        return ca.dot(excess(t), u)
-
+    beside = _BesideCylinder(ends, piece)
+    a, b, u, radius, half, slope = beside.a, beside.b, beside.u, beside.radius, beside.half, beside.slope
     square = ca.dot(u[:2], u[:2])
     product = ca.dot(a[:2], u[:2])
     root = ca.sqrt(ca.fmax(product**2 - square * (ca.dot(a[:2], a[:2]) - radius**2), 0.0))
@@ -237,18 +267,12 @@ def _segment_cylinder(
     t = _secant(low, high, slope_low, slope_high)
     settled = ca.logic_or(slope_low >= 0, slope_high <= 0)
     for _ in range(9):
-        x, value = _blend(a, b, t), slope(t)
-        rho = norm(x[:2])
+        value, newton = slope(t), beside.newton(t, FAR)
         low, high = ca.if_else(value < 0, t, low), ca.if_else(value < 0, high, t)
-        rate = ratio(ca.dot(x[:2], u[:2]), rho)
-        over_side, over_end = rho > radius, ca.fabs(x[2]) > half
-        curvature = ca.if_else(over_side, rate**2 + ratio(rho - radius, rho) * (square - rate**2), 0.0)
-        curvature += ca.if_else(over_end, u[2] ** 2, 0.0)
-        newton = t - ratio(value, curvature, FAR)
         inside = ca.logic_and(newton >= low, newton <= high)
         t = ca.if_else(settled, t, ca.if_else(inside, newton, 0.5 * (low + high)))
     if apart:
-        return _solid_contacts(u, turn, excess, t, None, breaks)
+        return _solid_contacts(u, beside.turn, beside.excess, t, None, breaks)
     first = ca.if_else(a[2] <= b[2], 0.0, 1.0)
     x = _blend(a, b, t_axis)
     radial = _unit(ca.vertcat(x[:2], 0.0), _unit(ca.vertcat(u[1], -u[0], 0.0), _AXES[:, 0]))
@@ -259,7 +283,7 @@ def _segment_cylinder(
             ca.vertcat(radius - norm(x[:2]), t_axis, radial),
         ]
     )
-    return _solid_contacts(u, turn, excess, t, ca.vertcat(0.0, way_out[1:]), breaks)
+    return _solid_contacts(u, beside.turn, beside.excess, t, ca.vertcat(0.0, way_out[1:]), breaks)
 
 
 def _segment_pair(a: Any, b: Any, c: Any, d: Any) -> list[Any]:
