@@ -1,6 +1,9 @@
 """The distance of every pair of a monitor, one by one."""
 
+import numpy as np
 from geometry_reference import segment_distance
+
+from vgtm_qp.geometry.groups import Group
 
 SHIFT = {"box": [0], "sphere": [0], "cylinder": [0], "triangle": [0, 3, 6]}
 
@@ -25,3 +28,20 @@ def brute_force(clearance, X, time):
                 axis = segment_distance("segment", ends[m], ends[k])
                 distances[m, k, True] = axis - radius - clearance.bodies.radius[k]
     return distances
+
+
+def every_pair(scene, X):
+    """Groups of all pairs of a scene, with their distances at `X` (P, 3) and time 0, each evaluated."""
+    bodies, pieces = np.arange(len(scene.bodies)), scene.pieces
+    pairs = [
+        (str(shape), np.tile(bodies, count), np.repeat(np.flatnonzero(pieces.shape == shape), len(bodies)))
+        for shape, count in zip(*np.unique(pieces.shape, return_counts=True), strict=True)
+    ]
+    if scene.has_self:
+        first, second = np.triu_indices(len(bodies), 1)
+        strangers = ~scene.bodies.may_touch(first, second)
+        pairs.append(("segment", first[strangers], second[strangers]))
+    groups = [Group(scene, *of) for of in pairs]
+    for group in groups:
+        group.keep_near(X, 0.0, np.inf)
+    return [group for group in groups if len(group)]

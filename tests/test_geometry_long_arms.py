@@ -1,14 +1,17 @@
 import numpy as np
 import pytest
+from brute_force import every_pair
 from geometry_reference import octahedral_arm
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from vgtm_qp.compiled import compiler
 from vgtm_qp.geometry.bodies import capsules
-from vgtm_qp.geometry.candidates import Candidates, every_pair
+from vgtm_qp.geometry.candidates import Candidates
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.geometry.shapes import box, sphere
+from vgtm_qp.geometry.watch import Watch
 
 BAYS = 40
 
@@ -96,13 +99,13 @@ def scene_and_states(seed, rods, count):
 
 
 @settings(max_examples=10, deadline=None)
-@given(st.integers(0, 2**31), st.booleans())
-def test_no_near_pair_of_what_bends_is_missed(seed, rods):
+@given(st.integers(0, 2**31), st.booleans(), st.booleans())
+def test_no_near_pair_of_what_bends_is_missed(seed, rods, tracked):
     rng, monitor, _, states = scene_and_states(seed, rods, 8)
     for state in states:
         exact = every_distance(monitor, state)
         reach, self_reach = rng.choice([0.2, 0.5]), rng.choice([0.1, 0.22, 0.5])
-        near = monitor.near(state, 0.0, reach, self_reach=self_reach)
+        near = monitor.near(state, 0.0, reach, self_reach=self_reach, tracked=tracked)
         for is_self, limit in ((False, reach), (True, self_reach)):
             counts = counted(near, is_self, exact[is_self].shape)
             np.testing.assert_array_equal(counts > 0, exact[is_self] < limit)
@@ -113,6 +116,28 @@ def test_no_near_pair_of_what_bends_is_missed(seed, rods):
         floors = {False: rng.choice([0.0, 0.08]), True: rng.choice([0.0, 0.03])}
         keeps = all((exact[is_self] >= floor).all() for is_self, floor in floors.items())
         assert monitor.keeps(state, 0.0, floors[False], floors[True]) == keeps
+
+
+@pytest.mark.skipif(compiler() is None, reason="no C compiler")
+@settings(max_examples=10, deadline=None)
+@given(st.integers(0, 2**31), st.booleans())
+def test_what_a_watch_proves_of_what_bends_holds_all_the_way(seed, rods):
+    """Small motions, after which pairs are listed anew now and then, and a watch that knows more than the state."""
+    rng, monitor, X, _ = scene_and_states(seed, rods, 0)
+    watch = Watch(monitor.scene, monitor.influence, monitor.self_influence)
+    for state in (squeezes if rods else bends)(rng, X, 12):
+        way = rng.choice([0.1, 0.3]) * (state - X)
+        exact = every_distance(monitor, X)
+        floors = [
+            max(0.0, rng.choice([0.5, 0.9]) * min(exact[is_self].min(), 0.4)) for is_self in (False, True)
+        ]
+        if rng.random() < 0.7:
+            watch.near(X, 0.0, floors[0] + 0.1, floors[1] + 0.1)
+        is_proven = watch.follow(np.stack([X, X + 0.5 * way, X + way]), 0.0, 0.0, *floors)
+        for share in (0.2, 0.5, 0.8, 1.0) if is_proven else ():
+            for is_self, distances in every_distance(monitor, X + share * way).items():
+                assert distances.min() >= floors[is_self] - 1e-9
+        X = X + way
 
 
 def check_bounds(candidates, motion, exact):

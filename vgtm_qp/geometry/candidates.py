@@ -29,11 +29,12 @@ class _PairList:
     """Pairs that share a reference: the positions (P, 3), m, and the time, s, at which they were compared.
 
     Pairs of the same kind that are not listed were at least the horizon, m, apart at the reference.
-    `unneeded` counts the pairs that have been evaluated since and were far.
+    `unneeded` counts the pairs that have been evaluated since and were far, `renewals` how often the list changed.
     """
 
     def __init__(self, reference: Array, time: float) -> None:
         self.groups: list[Group] = []
+        self.renewals = 0
         self.renew([], reference, time, np.inf)
 
     def renew(self, groups: list[Group], X: Array, time: float, horizon: float) -> None:
@@ -41,6 +42,7 @@ class _PairList:
         for group in groups:
             group.keep_near(X, time, horizon)
         self.reference, self.time, self.horizon, self.unneeded = X, time, horizon, 0
+        self.renewals += 1
         self.groups = [group for group in groups if len(group)]
 
     def __len__(self) -> int:
@@ -64,6 +66,16 @@ class Candidates:
     def groups(self) -> list[Group]:
         """The pairs of each shape; no group is empty."""
         return [group for pairs in self._lists for group in pairs.groups]
+
+    @property
+    def renewals(self) -> list[int]:
+        """How often each list changed; ``Group.place`` is the index of a group's list."""
+        return [pairs.renewals for pairs in self._lists]
+
+    @property
+    def parts(self) -> Parts | None:
+        """The parts of the arm; None where pairs of bodies do not count."""
+        return self._parts if self._lists and self._scene.has_self else None
 
     def forget_pieces(self) -> None:
         """Forget the pairs with pieces, because the pieces are others now; pairs of bodies are kept."""
@@ -160,6 +172,7 @@ class Candidates:
             for group in rigid.groups:
                 group.select(~parts.among(now_bending, group.body, group.other))
             rigid.groups = [group for group in rigid.groups if len(group)]
+            rigid.renewals += 1
         elif bending.horizon - 2.0 * (self._bending_displacement(X) + travel) >= reach:
             return
         bodies, self._bending_points = parts.inside(np.unique(parts.near[is_bending]))
@@ -226,37 +239,19 @@ class Candidates:
 
     def beyond(self, motion: Motion) -> tuple[float, float]:
         """Return lower bounds, m, of the distances of the pairs not listed: to pieces, and between bodies."""
-        to_pieces, rigid, bending = self._lists
-        far = to_pieces.horizon - motion[_TO_PIECES].greatest
+        far = self._lists[_TO_PIECES].horizon - motion[_TO_PIECES].greatest
         if not self._scene.has_self:
             return far, np.inf
+        return far, min(self.apart(motion))
+
+    def apart(self, motion: Motion) -> tuple[float, float]:
+        """Return lower bounds, m, of the distances of bodies that are not listed: in near parts, and in others."""
+        _, rigid, bending = self._lists
         # Pairs in near parts came nearer by no more than these bent; all other pairs are bounded by their
         # parts.
         since = motion[_RIGID].greatest - self._bent
-        far_self = min(rigid.horizon - self._bent, self._parts.beyond) - since
-        return far, min(far_self, bending.horizon - motion[_BENDING].greatest)
-
-
-def every_pair(scene: Scene, X: Array, time: float = 0.0) -> list[Group]:
-    """Return groups of all pairs of a scene, with their distances at `X` (P, 3) and a `time`, s."""
-    groups = every_pair_with_pieces(scene, X, time)
-    if scene.has_self:
-        bodies = np.arange(len(scene.bodies))
-        pairs = Group(scene, "segment", *_near_bodies(X, scene.bodies, bodies, FAR), place=_RIGID)
-        pairs.keep_near(X, time, FAR)
-        groups.append(pairs)
-    return [group for group in groups if len(group)]
-
-
-def every_pair_with_pieces(scene: Scene, X: Array, time: float) -> list[Group]:
-    """Return groups of all pairs of a body and a piece, with their distances at `X` (P, 3) and a `time`, s."""
-    bodies, groups = np.arange(len(scene.bodies)), []
-    for shape in np.unique(scene.pieces.shape).tolist() if len(scene.pieces) else []:
-        pieces = np.flatnonzero(scene.pieces.shape == shape)
-        group = Group(scene, shape, np.tile(bodies, len(pieces)), np.repeat(pieces, len(bodies)))
-        group.keep_near(X, time, FAR)
-        groups.append(group)
-    return [group for group in groups if len(group)]
+        near = min(rigid.horizon - self._bent - since, bending.horizon - motion[_BENDING].greatest)
+        return near, self._parts.beyond - since
 
 
 def _groups_with_pieces(X: Array, scene: Scene, time: float, horizon: float) -> list[Group]:

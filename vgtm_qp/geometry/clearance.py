@@ -28,7 +28,8 @@ class Clearance:
     """Distances of an arm's bodies from obstacles and from each other; one thread at a time.
 
     Positions ``X`` (P, 3), m, are those of the points that ``Bodies.points`` indexes. Lists of pairs that may be near
-    are kept from one call to the next. Small scenes are also watched, which is faster for the states of a motion.
+    are kept from one call to the next. Scenes without meshes and hulls are also watched, which is faster for the states
+    of a motion.
 
     Parameters
     ----------
@@ -41,7 +42,7 @@ class Clearance:
     self_collision : bool
         Whether pairs of bodies that are not neighbours count.
     watch : bool
-        Whether small scenes are watched; the answers are the same.
+        Whether scenes are watched; the answers are the same.
     by_fcl : bool
         Whether :meth:`near` may use python-fcl for the contacts of capsules.
     unit : float
@@ -117,7 +118,7 @@ class Clearance:
     def watching(self) -> Watch | None:
         """Return what watches the scene, if it can be watched and once that is compiled."""
         if self._watching is None and self.is_watched and is_ready(self.scene.shapes):
-            self._watching = Watch(self.scene)
+            self._watching = Watch(self.scene, self.influence, self.self_influence)
         return self._watching if self.is_watched else None
 
     def near(

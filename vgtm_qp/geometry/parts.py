@@ -23,6 +23,8 @@ class Parts:
 
     Attributes
     ----------
+    of : (B,) int
+        The part of each body.
     near : (K, 2) int
         Pairs of parts that are near, among them each part with itself.
     beyond : float
@@ -32,14 +34,14 @@ class Parts:
     def __init__(self, bodies: Bodies, X: Array, horizon: float) -> None:
         tree = cKDTree(X[bodies.points].mean(axis=1), leafsize=BODIES)
         first = _leaves(tree.tree)
-        self._of = np.empty(len(bodies), dtype=np.int64)
-        self._of[tree.indices] = np.searchsorted(first, np.arange(len(bodies)), side="right") - 1
+        self.of = np.empty(len(bodies), dtype=np.int64)
+        self.of[tree.indices] = np.searchsorted(first, np.arange(len(bodies)), side="right") - 1
         every = np.arange(len(first))
         self._thickness = np.zeros(len(every))
-        np.maximum.at(self._thickness, self._of, bodies.radius)
+        np.maximum.at(self._thickness, self.of, bodies.radius)
         # A point is in each part that has one of its bodies, once.
         span = bodies.points.shape[1]
-        points = np.unique(np.repeat(self._of, span) * len(X) + bodies.points.reshape(-1))
+        points = np.unique(np.repeat(self.of, span) * len(X) + bodies.points.reshape(-1))
         self._part, self._points = np.divmod(points, len(X))
         self._start = np.searchsorted(self._part, every)
         self._horizon = self.beyond = horizon
@@ -49,7 +51,7 @@ class Parts:
 
     def among(self, chosen: Mask, first: Index, second: Index) -> Mask:
         """Return (K,) which pairs of bodies are in the pairs of parts that `chosen` picks from `near`."""
-        return np.isin(self._codes_of(self._of[first], self._of[second]), self._codes[chosen])
+        return np.isin(self._codes_of(self.of[first], self.of[second]), self._codes[chosen])
 
     def _codes_of(self, first: Index, second: Index) -> Index:
         """Return (K,) a number for each pair of parts, the same in either order."""
@@ -57,7 +59,7 @@ class Parts:
 
     def inside(self, parts: Index) -> tuple[Index, Index]:
         """Return the bodies of some parts, and the points that span these."""
-        return np.flatnonzero(np.isin(self._of, parts)), np.unique(self._points[np.isin(self._part, parts)])
+        return np.flatnonzero(np.isin(self.of, parts)), np.unique(self._points[np.isin(self._part, parts)])
 
     def _balls(self, vectors: Array) -> tuple[Array, Array]:
         """Return centers (K, 3) and radii (K,) of balls round the vectors (P, 3) of the points of each part."""

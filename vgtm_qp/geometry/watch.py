@@ -1,10 +1,11 @@
-"""All pairs of a small scene, evaluated only when they may have come near.
+"""The pairs of a scene that may soon be near, evaluated only when they may have come near.
 
-Each pair keeps a lower bound of its distance: its distance at the last evaluation, less a bound of the
-approach of its bodies since. A body's distance from an obstacle changes by no more than an end of the body
-moves, and the obstacle. The distance of two bodies changes by no more than the relative displacement of their
-middles plus the turns of both about these. If the bound falls below the limit, the pair is evaluated, and its
-distance on the motion from the state before is bounded: ``pairs.c``.
+They are those that ``Candidates`` list, of a small scene all. Each pair keeps a lower bound of its distance: its
+distance at the last evaluation, less a bound of the approach of its bodies since. A body's distance from an obstacle
+changes by no more than an end of the body moves, and the obstacle. The distance of two bodies changes by no more than
+the relative displacement of their middles plus the turns of both about these. If the bound falls below the limit, the
+pair is evaluated, and its distance on the motion from the state before is bounded: ``pairs.c``. The pairs that are not
+listed have bounds as well, and are listed anew before they can be near.
 """
 
 from __future__ import annotations
@@ -18,30 +19,30 @@ import numpy as np
 from vgtm_qp.arrays import Array
 from vgtm_qp.compiled import Compiling, Kernel, compiler
 from vgtm_qp.errors import EvaluationError
-from vgtm_qp.geometry.candidates import every_pair, every_pair_with_pieces
+from vgtm_qp.geometry.candidates import Candidates
 from vgtm_qp.geometry.exact import CONTACT, WIDTH, follow_function, proof_function
-from vgtm_qp.geometry.formulas import FURTHEST
+from vgtm_qp.geometry.formulas import FAR, FURTHEST
 from vgtm_qp.geometry.groups import Found, Group, Scene
 from vgtm_qp.geometry.pairs import Contacts, Wanted
+from vgtm_qp.geometry.parts import Parts
 from vgtm_qp.geometry.shapes import GeometryError
 from vgtm_qp.native import Code, Program, building
 
-_MOST_PAIRS = 20_000
-"""Greatest number of pairs of a scene that can be watched."""
-
 AHEAD = 1.2
 """Distance below which pairs are evaluated, over the last limit: the next limit may be larger."""
+
+_AMPLE = 1.3
+"""Least bound of the distances of pairs that are not listed, over the distance below which pairs are evaluated."""
 
 _NEXT = 2.0
 """If no pair is near: distance below which pairs are still evaluated, in one call, over the limit."""
 
 
 def can_be_watched(scene: Scene) -> bool:
-    """Return whether there are no meshes and no hulls, and not too many pairs."""
+    """Return whether there are pairs, no meshes and no hulls."""
     bodies, pieces = len(scene.bodies), scene.pieces
     simple = not scene.bodies.hulls and "triangle" not in pieces.shape
-    count = bodies * len(pieces) + (bodies * (bodies - 1) // 2 if scene.has_self else 0)
-    return simple and bodies > 1 and 0 < count <= _MOST_PAIRS
+    return simple and bodies > 1 and (scene.has_self or len(pieces) > 0)
 
 
 @cache
@@ -68,9 +69,9 @@ def is_ready(shapes: Iterable[str]) -> bool:
 
 
 class WatchedGroup:
-    """The pairs of one shape, with bounds and contacts of the last evaluation."""
+    """Pairs of one shape, with bounds and contacts of the last evaluation; see :meth:`hold`."""
 
-    def __init__(self, group: Group) -> None:
+    def __init__(self, group: Group, lower: Array) -> None:
         function, compiling = _contact(group.shape, compiler())
         contact = Kernel(function, compiled=compiling)
         self._program = Program("Pairs")
@@ -88,15 +89,18 @@ class WatchedGroup:
             pair, answer = proof.inputs
             self._program.set(proof=proof, proof_pair=pair, answer=answer, proven=proof.outputs[0])
         self.data = self._program.data
-        self.hold(group)
+        self.hold(group, lower)
 
-    def hold(self, group: Group) -> None:
-        """Watch the pairs of `group`, of the same shape, in the place of those before."""
+    def hold(self, group: Group, lower: Array) -> None:
+        """Watch the pairs of `group`, of the same shape, in the place of those before.
+
+        `lower` (C,) are lower bounds of their distances, m.
+        """
         count, pieces = len(group), group.scene.pieces
-        self.group = group
+        self.group, self.body, self.other = group, group.body, group.other
         piece = np.zeros((count, WIDTH)) if group.is_self else pieces.parameters[group.other]
         normal = np.tile([0.0, 0.0, 1.0], (count, 1))
-        self._lower = group.distance.copy()
+        self._lower = lower.copy()
         self._rows, self._contacts = np.zeros(count, dtype=np.int64), np.zeros((2 * count, CONTACT))
         self._program.set(
             count=count,
@@ -135,30 +139,33 @@ class WatchedGroup:
 
 
 class Watch:
-    """Holds all pairs of a scene that :func:`can_be_watched`; one thread at a time.
+    """Holds the pairs of a scene that :func:`can_be_watched`; one thread at a time.
 
     States are positions of the points (P, 3), m, and times, s, at which pieces are where their motion leads.
+    `influence` and `self_influence` are those of ``Candidates``.
 
     Attributes
     ----------
     groups : list
-        The pairs of each shape.
+        The pairs of each list and shape.
     """
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: Scene, influence: float, self_influence: float) -> None:
         self._scene = scene
+        self._candidates, self._most = Candidates(scene, influence, self_influence), AHEAD * influence
         self.groups: list[WatchedGroup] = []
-        self._of_shape: dict[str, WatchedGroup] = {}
+        self._known: dict[tuple[int, str], WatchedGroup] = {}
         self._way: Program | None = None
-        self._is_whole = True
+        self._renewals: list[int] = []
+        self._parts: Parts | None = None
         self._place: Array = np.zeros((0, 3))
 
     def forget_pieces(self) -> None:
         """Forget the pairs with pieces, because the pieces are others now; pairs of bodies are kept."""
-        self.groups = [pairs for pairs in self.groups if pairs.group.is_self]
-        self._is_whole = False
+        self._candidates.forget_pieces()
         if self._way is not None:
-            self._way.set(reach=-np.inf, self_reach=-np.inf)
+            self._hold([pairs for pairs in self.groups if pairs.group.is_self])
+            self._way.set(reach=-np.inf, self_reach=-np.inf, far=-np.inf)
 
     def near(
         self,
@@ -186,7 +193,14 @@ class Watch:
     def keeps(self, X: Array, time: float, floor: float, self_floor: float) -> bool:
         """Return whether `X` and `time` are the present state, with no surface distance below its floor, m."""
         floors = floor, self_floor
-        return self._is_at(X, time) and all(pairs.keeps(floors[pairs.group.is_self]) for pairs in self.groups)
+        if self._way is None or not self._is_at(X, time):
+            return False
+        far, self_far = self._far(self._way)
+        return (
+            far >= floor
+            and self_far >= self_floor
+            and all(pairs.keeps(floors[pairs.group.is_self]) for pairs in self.groups)
+        )
 
     def follow(
         self, places: Array, start_time: float, end_time: float, floor: float, self_floor: float
@@ -202,12 +216,15 @@ class Watch:
 
     def move_to(self, X: Array, time: float, limit: float, self_limit: float) -> Program:
         """Make `X` and `time` the present state, with all contacts nearer than the limits, m; return C's ``Way``."""
-        way = self._way
-        is_here = way is not None and self._is_at(X, time)
-        if way is None or not is_here or limit > way.data.reach or self_limit > way.data.self_reach:
-            self.started(X, time).set(wanted=limit, self_wanted=self_limit)
+        way = self.started(X, time)
+        if not self._is_at(X, time) or limit > way.data.reach or self_limit > way.data.self_reach:
+            way.set(wanted=limit, self_wanted=self_limit)
             self._go_to(X, time)
-        return self.started(X, time)
+            if limit > way.data.reach or self_limit > way.data.self_reach:
+                # On the way there pairs that are not listed may have come near.
+                self._list(way, X, time)
+                self._go(np.stack([X, X]), time, time, -np.inf, -np.inf)
+        return way
 
     def _clock(self, time: float) -> float:
         """Return the time that tells where pieces are: zero where they rest, else `time`, s."""
@@ -218,7 +235,12 @@ class Watch:
         way = self._way
         if way is None or way.data.lost or not way.data.reach > -np.inf:
             return False
-        return bool(way.data.time == self._clock(time)) and X.tobytes() == self._place.tobytes()
+        return self._is_there(X, time)
+
+    def _is_there(self, X: Array, time: float) -> bool:
+        """Return whether `X` (P, 3) and `time` are the present state, whose pairs may not have been evaluated."""
+        assert self._way is not None
+        return bool(self._way.data.time == self._clock(time)) and X.tobytes() == self._place.tobytes()
 
     def _go_to(self, X: Array, time: float) -> None:
         """Go from the present state, if there is one, to another."""
@@ -236,8 +258,8 @@ class Watch:
         GeometryError
             A position is not finite; the present state stays as it was.
         """
-        way = self.started(places[0], start_time)
-        places = np.ascontiguousarray(places)
+        way, places = self._way, np.ascontiguousarray(places)
+        assert way is not None
         self.refresh()
         way.set(
             pieces=len(places) - 1,
@@ -262,18 +284,30 @@ class Watch:
             self._pairs[k] = pairs.address()
 
     def started(self, X: Array, time: float) -> Program:
-        """Return the ``Way`` of C; list the pairs that are not listed: all in the state, or those with pieces."""
-        if self._way is None or self._way.data.lost:
+        """Return the ``Way`` of C, with all pairs that can be near in a step from a state, or of a small scene all."""
+        way = self._way
+        if way is None or way.data.lost:
             return self._start(X, time)
-        if not self._is_whole:
-            groups = every_pair_with_pieces(self._scene, self._place, self._way.data.time)
-            self._hold([*map(self._watched, groups), *self.groups])
-        return self._way
+        (far, self_far), (needed, self_needed) = self._far(way), self._needed(way)
+        # NaN fails the comparisons.
+        if not (far >= needed and self_far >= self_needed):
+            self._list(way, X, time)
+        return way
+
+    def _far(self, way: Program) -> tuple[float, float]:
+        """Return lower bounds of the distances of pairs that are not listed, m: to pieces and between bodies."""
+        return way.data.far, min(way.data.self_far, way.data.parted)
+
+    def _needed(self, way: Program) -> tuple[float, float]:
+        """Return the least bounds of the distances of pairs that are not listed, m: to pieces and between bodies."""
+        wanted, self_wanted = way.data.wanted, way.data.self_wanted
+        ample, self_ample = (min(_AMPLE * distance, self._most) for distance in (wanted, self_wanted))
+        return max(wanted, ample), max(self_wanted, self_ample)
 
     def _start(self, X: Array, time: float) -> Program:
-        """List all pairs, with their distances in the state."""
-        bodies, self._way, self._place = self._scene.bodies, Program("Way"), X.copy()
-        self._way.set(
+        """Begin in a state."""
+        bodies, way, self._place, self._renewals = self._scene.bodies, Program("Way"), X.copy(), []
+        way.set(
             points=len(X),
             bodies=len(bodies),
             ends=np.ascontiguousarray(bodies.points, dtype=np.int32),
@@ -283,23 +317,63 @@ class Watch:
             moved=np.zeros(len(bodies)),
             place=self._place,
             time=self._clock(time),
+            fastest=self._scene.pieces.fastest,
+            neighbours=0,
             **dict.fromkeys(("reach", "self_reach", "wanted", "self_wanted"), -np.inf),
+            **dict.fromkeys(("self_far", "parted"), np.inf),
         )
-        self._hold(list(map(self._watched, every_pair(self._scene, X, self._clock(time)))))
-        return self._way
+        self._way, self._parts = way, None
+        self._list(way, X, time)
+        return way
 
-    def _watched(self, group: Group) -> WatchedGroup:
-        """Return what watches the pairs of `group`; kernels of a shape are set up once."""
-        known = self._of_shape.get(group.shape)
-        if known is None:
-            known = self._of_shape[group.shape] = WatchedGroup(group)
+    def _list(self, way: Program, X: Array, time: float) -> None:
+        """Go to a state, and list the pairs there that may be near soon."""
+        if self._renewals and not self._is_there(X, time):
+            self._go(np.stack([self._place, X]), way.data.time, time, -np.inf, -np.inf)
+        candidates, at = self._candidates, self._clock(time)
+        needed, self_needed = self._needed(way)
+        motion = candidates.cover(X, at, max(needed, 0.0), max(self_needed, 0.0))
+        before, self._renewals = self._renewals or [0] * len(candidates.renewals), candidates.renewals
+        renewed = [place for place, count in enumerate(self._renewals) if count != before[place]]
+        way.set(far=candidates.beyond(motion)[0])
+        parts = candidates.parts
+        if parts is not None:
+            near, parted = candidates.apart(motion)
+            # What C knows of near parts, which moved together, may be more; of lists that it has.
+            way.set(self_far=near if any(renewed) else max(near, way.data.self_far), parted=parted)
+        if parts is not None and parts is not self._parts:
+            self._parts = parts
+            way.set(
+                parts=len(size := np.bincount(parts.of)),
+                size=size.astype(np.int32),
+                part=parts.of.astype(np.int32),
+                neighbours=0 if near >= 0.5 * FAR else len(parts.near),
+                neighbour=np.ascontiguousarray(parts.near, dtype=np.int32),
+                shift=np.zeros((len(size), 3)),
+                bent=np.zeros(len(size)),
+            )
+        if renewed:
+            kept = [pairs for pairs in self.groups if pairs.group.place not in renewed]
+            new = [
+                self._watched(group, group.lower(motion, np.inf)[0])
+                for group in candidates.groups
+                if group.place in renewed
+            ]
+            self._hold([*new, *kept])
+            way.set(reach=-np.inf, self_reach=-np.inf)
+
+    def _watched(self, group: Group, lower: Array) -> WatchedGroup:
+        """Return what watches the pairs of `group`; kernels of a list's shape are set up once."""
+        key = group.place, group.shape
+        if key in self._known:
+            self._known[key].hold(group, lower)
         else:
-            known.hold(group)
-        return known
+            self._known[key] = WatchedGroup(group, lower)
+        return self._known[key]
 
     def _hold(self, groups: list[WatchedGroup]) -> None:
-        """Watch the pairs of `groups`, whose distances are those at the present place."""
+        """Watch the pairs of `groups`, whose bounds are those at the present place."""
         assert self._way is not None
-        self.groups, self._is_whole = groups, True
-        self._pairs = np.zeros(len(groups), dtype=np.uintp)
+        self.groups = groups
+        self._pairs = np.array([pairs.address() for pairs in groups], dtype=np.uintp)
         self._way.set(groups=len(groups), group=self._pairs)

@@ -52,6 +52,13 @@ typedef struct {
 
     double *place, time;             /* (P, 3), s: the present ones, where pairs nearer than the reach are evaluated */
     double reach, self_reach, wanted, self_wanted;    /* wanted: the reach of the next place */
+    /* Lower bounds of the distances of pairs that no group has: from pieces, the fastest of which has that speed, m/s;
+       between bodies in parts of the arm that are near to each other, and in others. Number of bodies of each part, the
+       part of each body, and pairs of near parts, each with itself among them. */
+    double far, self_far, parted, fastest;
+    int parts, neighbours;
+    const int *size, *part, *neighbour;    /* (parts), (B), (neighbours, 2) */
+    double *shift, *bent;                  /* (parts, 3), (parts): ball of the displacements of a part's bodies */
     int lost;                        /* whether a pair had no value, so that nothing is known of any */
 
     double *middle, *turned, *moved; /* (B, 3), (B), (B): of each axis in the present piece the displacement
@@ -59,6 +66,13 @@ typedef struct {
     double since, until;             /* times at both ends of that piece */
     int done;                        /* number of pieces that were followed */
 } Way;
+
+static double greatest_of(const double *values, int count)
+{
+    double greatest = 0.0;
+    for (int k = 0; k < count; k++) greatest = values[k] > greatest ? values[k] : greatest;
+    return greatest;
+}
 
 static void displace(Way *w, const double *before, const double *after)
 {
@@ -76,6 +90,27 @@ static void displace(Way *w, const double *before, const double *after)
         w->turned[b] = sqrt(square[2]);
         w->moved[b] = sqrt(square[0] > square[1] ? square[0] : square[1]);
     }
+}
+
+/* How much nearer two bodies of near parts came in the present piece at most: moving together they do not. */
+static double bending(Way *w)
+{
+    double most = 0.0;
+    memset(w->shift, 0, sizeof(double) * 3 * w->parts);
+    memset(w->bent, 0, sizeof(double) * w->parts);
+    for (int b = 0; b < w->bodies; b++)
+        for (int a = 0; a < 3; a++) w->shift[3 * w->part[b] + a] += w->middle[3 * b + a] / w->size[w->part[b]];
+    for (int b = 0; b < w->bodies; b++) {
+        int p = w->part[b];
+        double off = sqrt(square_of(w->middle + 3 * b, w->shift + 3 * p)) + w->turned[b];
+        w->bent[p] = fmax(off, w->bent[p]);
+    }
+    for (int k = 0; k < w->neighbours; k++) {
+        int p = w->neighbour[2 * k], q = w->neighbour[2 * k + 1];
+        double change = sqrt(square_of(w->shift + 3 * p, w->shift + 3 * q)) + w->bent[p] + w->bent[q];
+        most = fmax(change, most);
+    }
+    return most;
 }
 
 /* Replace points by where they are at a time from the piece of pair k: in a frame that moves with that, and is the
@@ -204,6 +239,12 @@ EXPORT int follow(Way *w)
         w->since = w->until;
         w->until = is_last ? w->end : w->start + (double)w->done / w->pieces * (w->end - w->start);
         displace(w, before, after);
+        double greatest = greatest_of(w->moved, w->bodies);
+        w->far -= greatest + w->fastest * fabs(w->until - w->since);
+        w->parted -= 2.0 * greatest;
+        if (w->neighbours) w->self_far -= bending(w);
+        double self_far = least_of(w->self_far, w->parted);
+        if (!(w->far >= w->floor && self_far >= w->self_floor)) is_proven = 0;
         for (int g = 0; g < w->groups; g++) {
             Pairs *pairs = w->group[g];
             /* Before the last place only the floor matters. */
@@ -219,8 +260,8 @@ EXPORT int follow(Way *w)
     }
     memcpy(w->place, w->places + w->done * step, sizeof(double) * step);
     w->time = w->until;
-    w->reach = w->done == w->pieces ? w->limit : w->floor;
-    w->self_reach = w->done == w->pieces ? w->self_limit : w->self_floor;
+    w->reach = fmin(w->done == w->pieces ? w->limit : w->floor, w->far);
+    w->self_reach = fmin(w->done == w->pieces ? w->self_limit : w->self_floor, least_of(w->self_far, w->parted));
     return is_proven ? DONE : NOT_PROVEN;
 }
 

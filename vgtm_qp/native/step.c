@@ -436,6 +436,7 @@ static double greatest_gap(const StepData *s)
 /* Whether every pair keeps its clearance at the present place of the way. */
 static int is_clear(const StepData *s)
 {
+    if (!(s->way->far >= s->safe - s->rounding && fmin(s->way->self_far, s->way->parted) >= s->self_safe - s->rounding)) return 0;
     for (int g = 0; g < s->way->groups; g++) {
         const Pairs *p = s->way->group[g];
         double floor = (p->is_self ? s->self_safe : s->safe) - s->rounding;

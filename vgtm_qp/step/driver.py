@@ -337,12 +337,14 @@ class Driver:
         near, work = int(self._work.data.near), self._work
         if not near or self._watch is None:
             return _NO_ROWS
-        names, groups = self._setup.monitor.names, [pairs.group for pairs in self._watch.groups]
+        # The pairs of a group change where they are listed anew; its arrays then are others.
+        names = self._setup.monitor.names
+        groups = [(pairs.body, pairs.other, pairs.group.is_self) for pairs in self._watch.groups]
         group, pair = self._arrays.group[:near].copy(), self._arrays.pair[:near].copy()
 
         def name(k: int) -> str:
-            of, row = groups[group[k]], pair[k]
-            return names.clearance(Pair(int(of.body[row]), int(of.other[row]), of.is_self))
+            (body, other, is_self), row = groups[group[k]], pair[k]
+            return names.clearance(Pair(int(body[row]), int(other[row]), is_self))
 
         data = self._arrays.data
         return ClearanceRows(
