@@ -19,6 +19,7 @@ from vgtm_qp.problem.obstacle import Sphere
 from vgtm_qp.qp import fused
 from vgtm_qp.qp.residual import InfeasibleStepError
 from vgtm_qp.rotation import rotation_from_vector, vector_from_rotation
+from vgtm_qp.step.chain_engine import ChainEngine
 from vgtm_qp.step.driver import Begun, Denied, Driver, Lost, Passage
 from vgtm_qp.step.path import Path
 from vgtm_qp.study.scenes import random_scene
@@ -215,6 +216,50 @@ def test_a_curve_with_nearly_a_cusp_is_left_to_attempts(driven):
     assert not any(driven)
     assert found.qps == expected.qps
     np.testing.assert_allclose(found.state.q, expected.state.q, atol=1e-9)
+
+
+POINTING = {"end_effector": {"track": ["position", "pointing"]}, "waypoint": {"pointing": [0, 0, 1]}}
+ORIENTED = {
+    "end_effector": {"track": ["position", "orientation"]},
+    "waypoint": {"rotation_vector": [0, 0, 0]},
+}
+LONG = [
+    ("octahedral", "elastic", {}),
+    ("octahedral", "exact", {}),
+    ("octahedral", "hard", {}),
+    ("octahedral", "elastic", POINTING),
+    ("hexapod", "elastic", ORIENTED),
+    ("hexapod", "elastic", {}),
+    ("tetrahedral", "elastic", {}),
+    ("longeron", "elastic", {}),
+]
+
+
+@pytest.mark.parametrize("distance", ["fcl", "exact"])
+@pytest.mark.parametrize(("module", "mode", "asked"), LONG, ids=str)
+def test_it_takes_the_steps_of_long_arms_among_obstacles(module, mode, asked, distance, driven, rng):
+    truss = {"module": module, "stroke": [0.6, 1.5] if module == "tetrahedral" else None}
+    more = {"curve": {"control_vertices": 6}, "method": {"tracking_mode": mode}}
+    problem = arm_problem(bays=26, truss=truss, **more, **asked)
+    height = vq.Resolver(problem).tip()[0][2]
+    obstacles = [
+        {"shape": "box", "name": "cube", "center": [1.22, 0.1, 0.97 * height], "size": [0.8, 0.8, 0.8]},
+        {"shape": "sphere", "name": "ball", "center": [-0.3, 1.25, 0.93 * height], "radius": 0.5},
+        {
+            "shape": "cylinder",
+            "name": "post",
+            "center": [-1.0, -0.8, 0.97 * height],
+            "radius": 0.4,
+            "height": 2.0,
+        },
+    ]
+    clearance = {"clearance.safe": 0.05, "clearance.influence": 0.4, "clearance.distance": distance}
+    problem = problem.replace({"obstacle": obstacles, **clearance})
+    assert isinstance(vq.Resolver(problem).setup.engine, ChainEngine)
+    finish_compiling()
+    driven.clear()
+    compare(problem, rng, 12, SAME)
+    assert any(driven)
 
 
 @pytest.mark.parametrize("number", range(12))

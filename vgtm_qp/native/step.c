@@ -1,13 +1,15 @@
 /* A step of an arm in one call: near pairs, QP, settling, the checks of the new state and the proof of the way there.
 
    It is for arms whose bodies are capsules, among pairs that a Way holds. The caller fills in goal and
-   boxes among the arguments of the QP's function. Anything unusual ends the step with a code and leaves the state as it
+   boxes among the arguments of the QP's function. A long arm's QP is a Chain's; then the Fused has the input, in the
+   order of StepGraph.inputs, and names the places of the answer, but has no functions. Anything unusual ends the step with a code and leaves the state as it
    was; the caller then asks for a further QP, or takes the step by other means. */
 
 #include <time.h>
 
 typedef struct {
     Fused *fused;
+    Chain *chain;                  /* or null */
     Way *way;                      /* null if no two bodies, and no body and piece, can ever be near */
     /* See arm.Arithmetic; without an eval the nodes are q, or move straight. (tip's nodes) -> its rotation. */
     Kernel place, bend, frame;
@@ -233,12 +235,51 @@ static void look_ahead(StepData *s)
     set_limits(s, s->drift);
 }
 
+/* Set up the QP at the input. */
+static int assemble_qp(StepData *s)
+{
+    Chain *c = s->chain;
+    if (!c) return assemble(s->fused);
+    c->near = s->fused->near;
+    if (c->slots != s->slots) c->pressing = 0;
+    c->slots = s->slots;
+    if (!*c->motion) memset(c->pull, 0, sizeof(double) * 3 * c->vertices);
+    return chain_assemble(c);
+}
+
+/* Solve the QP that was set up, with its rows of clearance. */
+static int answer_qp(StepData *s)
+{
+    return s->chain ? chain_answer(s->chain) : answer(s->fused);
+}
+
+/* Follow the answer from the configuration `q`, in which the base is where it is after the step, and settle. */
+static int depart_from(StepData *s, const double *q)
+{
+    Fused *f = s->fused;
+    Chain *c = s->chain;
+    if (!c) return depart(f, q, s->tolerance);
+    memcpy(c->begun, q, sizeof(double) * f->coordinates);
+    int code = chain_depart(c, s->tolerance);
+    f->reached = c->reached;
+    f->furthest = c->furthest;
+    return code;
+}
+
+/* The multipliers of the rows of clearance. */
+static const double *near_multipliers(const StepData *s)
+{
+    const Fused *f = s->fused;
+    if (s->chain) return s->chain->every + near_at(s->chain);
+    return f->multipliers + f->unknowns + f->tips + f->hard + f->legs;
+}
+
 /* Ask for the contacts of all rows, or of those that press: whose multipliers are not zero. Those that were asked for
    before are left out; return whether there are others. */
 static int ask_for(StepData *s, int all)
 {
     Fused *f = s->fused;
-    const double *multiplier = f->multipliers + f->unknowns + f->tips + f->hard + f->legs;
+    const double *multiplier = near_multipliers(s);
     int before = s->asked_for;
     s->round++;
     for (int k = 0; k < f->near; k++) {
@@ -563,10 +604,10 @@ static int arrive(StepData *s)
 static int proceed(StepData *s, double *mark)
 {
     Fused *f = s->fused;
-    int code = answer(f);
+    int code = answer_qp(s);
     if (!code && s->asks && !f->other && ask_for(s, 0)) code = ASKS;
     else if (!code) {
-        code = depart(f, s->corrects ? f->condense.arg[0] : s->based_q, s->tolerance);
+        code = depart_from(s, s->corrects ? f->condense.arg[0] : s->based_q);
         s->settled = !code;
         if (code == UNSETTLED && leaps(s, f->started, f->started_points)) code = FLAWED;
     }
@@ -587,7 +628,7 @@ static int solve_step(StepData *s, double *mark)
         s->way->wanted = s->ahead * s->limit;
         s->way->self_wanted = s->ahead * s->self_limit;
     }
-    code = assemble(s->fused);
+    code = assemble_qp(s);
     /* A solver that only comes near zero does not say which rows press, and is too slow to be asked twice. */
     if (!code && s->asks && s->fused->other && ask_for(s, 1)) code = ASKS;
     spend(&s->spent[QP], mark);

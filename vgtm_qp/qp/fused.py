@@ -43,6 +43,7 @@ from vgtm_qp.qp.settle import (
     missing_function,
 )
 from vgtm_qp.qp.shape import CurveRows
+from vgtm_qp.qp.stepper import NearRows
 from vgtm_qp.rows.tip import TipGoal
 
 _NOWHERE: Array = np.zeros((0, 3))
@@ -110,6 +111,11 @@ class FusedSolver:
     def kernels(self) -> tuple[Kernel, ...]:
         """What the C calls: the functions of the rows, of what settling misses, of the closing, and of the curve."""
         return self.workspace.kernels
+
+    @property
+    def corrects(self) -> bool:
+        """See :class:`~vgtm_qp.qp.stepper.Stepper`."""
+        return True
 
     def load(self, asked: StepInput) -> None:
         """Set the state, the goal and the boxes of the next QP."""
@@ -279,9 +285,14 @@ class FusedWorkspace:
         return self._program.data
 
     @property
-    def address(self) -> int:
-        """Of the structure."""
-        return self._program.address
+    def structures(self) -> dict[str, int]:
+        """See :class:`~vgtm_qp.qp.stepper.Workspace`."""
+        return {"fused": self._program.address}
+
+    @property
+    def inputs(self) -> Sequence[Array]:
+        """See :class:`~vgtm_qp.qp.stepper.Workspace`."""
+        return self.condense.inputs
 
     def refresh(self) -> None:
         """Use the kernels that were compiled meanwhile."""
@@ -356,31 +367,22 @@ class FusedWorkspace:
     def take(self, clearance: ClearanceRows) -> int:
         """Give the rows of clearance to the QP, and return their number."""
         near, slots = clearance.nodes.shape
-        if near > self._room or slots > self._slots:
-            self._reserve(max(2 * near, self._room), max(slots, self._slots))
-        data = self.data
-        data.near = near
+        if not self._rows.hold(near, slots):
+            self.reserve(2 * near, slots)
+        self.data.near = near
         if near:
-            data.slots = slots
-            self._near_nodes[: near * slots] = clearance.nodes.reshape(-1)
-            self._near_rows[: 3 * near * slots] = clearance.coefficients.reshape(-1)
-            self._near_lower[:near] = clearance.lower
+            self.data.slots = slots
+            self._rows.write(clearance)
         return int(near)
 
     def near(self, count: int) -> tuple[Index, Array, Array]:
-        """Return nodes (R, S), coefficients (R, S, 3) and bounds (R,) of the first rows of clearance."""
-        slots = self.data.slots
-        nodes, rows = self._near_nodes[: slots * count], self._near_rows[: 3 * slots * count]
-        return (
-            nodes.reshape(-1, slots).astype(np.int64),
-            rows.reshape(-1, slots, 3).copy(),
-            self._near_lower[:count].copy(),
-        )
+        """See :class:`~vgtm_qp.qp.stepper.Workspace`."""
+        return self._rows.read(count, self.data.slots)
 
     def reserve(self, near: int, slots: int) -> None:
-        """Make room for `near` rows of clearance over `slots` nodes at least."""
-        if near > self._room or slots > self._slots:
-            self._reserve(max(near, self._room), max(slots, self._slots))
+        """See :class:`~vgtm_qp.qp.stepper.Workspace`."""
+        if not self._rows.hold(near, slots):
+            self._reserve(max(near, self._rows.near), max(slots, self._rows.slots))
 
     def closed(self) -> Closed:
         """Return the settled configuration."""
@@ -498,10 +500,8 @@ class FusedWorkspace:
     def _reserve(self, near: int, slots: int) -> None:
         """Make room for `near` rows of clearance over `slots` nodes each."""
         size, tips = self.size, len(self._layout.tip_rows)
-        self._room, self._slots, rows = near, slots, self.first_near + near
+        self._rows, rows = NearRows(near, slots), self.first_near + near
         self.constraint, self.multipliers = np.zeros((rows, size)), np.zeros(size + rows)
-        self._near_nodes = np.zeros(near * slots, dtype=np.int32)
-        self._near_rows, self._near_lower = np.zeros(3 * near * slots), np.zeros(near)
         self.lower, self.upper = np.full(size + rows, -UNBOUNDED), np.full(size + rows, UNBOUNDED)
         self._sense = np.zeros(size + rows, dtype=np.int32)
         self._sense[size : size + self.equal] = EQUALITY
@@ -509,9 +509,7 @@ class FusedWorkspace:
         for name, array in (("lower", self.lower), ("upper", self.upper)):
             self.condense.bind_output(RESULTS.index(name), array[: size + tips])
         self._program.set(
-            near_nodes=self._near_nodes,
-            near_rows=self._near_rows,
-            near_lower=self._near_lower,
+            **self._rows.fields,
             constraint=self.constraint,
             lower=self.lower,
             upper=self.upper,
@@ -528,14 +526,9 @@ def _numbers(layout: Layout) -> dict[str, Any]:
     arm, nodes = layout.arm, layout.node_columns
     place, of, share, by_nodes = _places(layout)
     return {
-        "actuators": len(arm.actuators),
+        **placement(layout),
         "nodes": nodes,
-        "tips": len(layout.tip_rows),
         "hard": len(layout.hard),
-        "legs": len(layout.legs),
-        "vertices": layout.vertices,
-        "torsion": layout.torsion,
-        "coordinates": arm.home_configuration.size,
         "by_nodes": int(by_nodes),
         "scale": 1.0 / float(np.sqrt(layout.weights.node_rate)),
         "actuator_weight": layout.actuator_weights,
@@ -553,37 +546,44 @@ def _numbers(layout: Layout) -> dict[str, Any]:
         "place": place,
         "of": of,
         "share": share,
+    }
+
+
+def placement(layout: Layout) -> dict[str, Any]:
+    """Return by field what the C knows of the places of tip, stations and curve."""
+    stations, tip, tracked = layout.arm.stations, layout.arm.end_effector, layout.tracked
+    return {
+        "tips": len(layout.tip_rows),
+        "legs": len(layout.legs),
+        "vertices": layout.vertices,
+        "torsion": layout.torsion,
+        "coordinates": layout.arm.home_configuration.size,
+        "actuators": len(layout.arm.actuators),
         "node_column": layout.node_column.astype(np.int32),
+        "tip_nodes": len(tip.nodes),
+        "tip_node": tip.nodes.astype(np.int32),
+        "stations": len(tracked),
+        "station_node": np.ascontiguousarray(stations.nodes[tracked], dtype=np.int32),
+        "station_weight": np.ascontiguousarray(stations.weights[tracked]),
+        "curve_weight": np.ascontiguousarray(layout.curve_weights),
+        "curve_slope": np.ascontiguousarray(layout.curve_slopes),
     }
 
 
 def _composition(layout: Layout, condense: Kernel) -> dict[str, Any]:
-    """Return by field what the C knows of the rows of tip, stations and curve, with which it composes the QP."""
-    stations, tip, tracked, weights = (
-        layout.arm.stations,
-        layout.arm.end_effector,
-        layout.tracked,
-        layout.weights,
-    )
+    """Return by field how the C weights the rows of stations and curve, with which it composes the QP."""
+    weights = layout.weights
     angles = np.array([weights.tangent, weights.tangent, weights.roll])[: layout.turns]
     gaps = np.where(layout.hard_gaps, 1.0, np.sqrt(weights.tracking))
     turns = np.where(layout.hard_tilts, 1.0, np.sqrt(angles))
     spacings = np.full(layout.spacings, np.sqrt(weights.spacing))
-    curve: dict[str, Any] = {
-        "curve_weight": np.ascontiguousarray(layout.curve_weights),
-        "curve_slope": np.ascontiguousarray(layout.curve_slopes),
-    }
+    curve: dict[str, Any] = {}
     if layout.general is not None:
         points, rows = (12 + CurveRows._fields.index(name) for name in ("position_rows", "spacing_rows"))
-        curve |= {"point_rows": condense.inputs[points], "stretch_rows": condense.inputs[rows]}
+        curve = {"point_rows": condense.inputs[points], "stretch_rows": condense.inputs[rows]}
     return {
-        "tip_nodes": len(tip.nodes),
-        "tip_node": tip.nodes.astype(np.int32),
-        "stations": len(tracked),
         "turned": layout.turns,
         "spacings": layout.spacings,
-        "station_node": np.ascontiguousarray(stations.nodes[tracked], dtype=np.int32),
-        "station_weight": np.ascontiguousarray(stations.weights[tracked]),
         "row_weight": np.concatenate([gaps.reshape(-1), turns.reshape(-1), spacings]),
         **curve,
     }

@@ -30,7 +30,7 @@ from vgtm_qp.step.driver import (
     can_drive,
     is_cut_short,
 )
-from vgtm_qp.step.engine import Engine, FusedEngine
+from vgtm_qp.step.engine import Engine
 from vgtm_qp.step.separation import RECOVERY, Separation
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import Shortfall, State
@@ -127,7 +127,7 @@ class Attempt:
     def usual(self, state: State, target: Target) -> Step | None:
         """Return the step of :meth:`run` if it is a usual one, in one call; what was found out is kept for ``run``."""
         engine, self._tried = self._setup.engine, None
-        if not self._can_drive or self.separation.shortfall_of(state) or not isinstance(engine, FusedEngine):
+        if not self._can_drive or self.separation.shortfall_of(state) or engine.stepper is None:
             return None
         driven = self._driven(state, target, 1.0, engine)
         self._tried = state, target, driven
@@ -173,7 +173,7 @@ class Attempt:
         driven: Step | Begun | None = None
         if tried is not None and tried[:2] == (state, target) and engine is self._setup.engine:
             driven = tried[2]
-        elif self._can_drive and not short and progress == 0.0 and isinstance(engine, FusedEngine):
+        elif self._can_drive and not short and progress == 0.0 and engine.stepper is not None:
             driven = self._driven(state, target, share, engine)
         if isinstance(driven, Step):
             return driven
@@ -191,11 +191,14 @@ class Attempt:
                 break
         return step
 
-    def _driven(self, state: State, target: Target, share: float, engine: FusedEngine) -> Step | Begun | None:
+    def _driven(self, state: State, target: Target, share: float, engine: Engine) -> Step | Begun | None:
         """Return the step in one call, or its beginning if it needs further QPs; None if it is no usual one."""
         driver = self._drivers.get(engine)
         if driver is None:
-            driver = self._drivers[engine] = Driver(self._setup, engine, self.accuracy, self.separation)
+            assert engine.stepper is not None
+            driver = self._drivers[engine] = Driver(
+                self._setup, engine.stepper, self.accuracy, self.separation
+            )
             self.phases.join(PHASES, driver.spent)
         taken = driver.take(state, target, share)
         if taken is None or isinstance(taken, Begun):

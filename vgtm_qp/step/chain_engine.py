@@ -18,6 +18,7 @@ from vgtm_qp.qp.long.ends import end_function
 from vgtm_qp.qp.long.solver import ChainSolver
 from vgtm_qp.qp.numbers import Legs, RowNumbers, beyond
 from vgtm_qp.qp.settle import TOO_FAR, enough_length, enough_tip_error, held
+from vgtm_qp.qp.stepper import Stepper
 from vgtm_qp.rows.tip import TipGoal, progress_gradient
 from vgtm_qp.step.closing import Closing, Correct, converge
 from vgtm_qp.step.engine import Engine, Spent
@@ -59,6 +60,11 @@ class ChainEngine(Engine):
         return not arm.base[arm.end_effector.nodes].any() and (
             not layout.vertices or bool(arm.base[arm.stations.nodes[0]].all())
         )
+
+    @property
+    def stepper(self) -> Stepper:
+        """See ``engine.Engine``."""
+        return self.compiled
 
     def move(self, asked: QPInput, accuracy: Accuracy, spent: Spent) -> Move:
         """See ``engine.Engine``; by one call of C once that is compiled.

@@ -20,8 +20,9 @@ from vgtm_qp.geometry.pairs import Pair
 from vgtm_qp.geometry.watch import Watch
 from vgtm_qp.native import Code
 from vgtm_qp.qp.answer import Accuracy, Move, StepSolution
+from vgtm_qp.qp.fused import FusedWorkspace
 from vgtm_qp.qp.numbers import ClearanceRows
-from vgtm_qp.step.engine import FusedEngine
+from vgtm_qp.qp.stepper import Stepper
 from vgtm_qp.step.separation import Separation
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import State
@@ -40,6 +41,9 @@ _NOTHING = 1e-9
 
 _AGAIN = Code.UNSETTLED, Code.TOO_NEAR, Code.OFF_CURVE
 """How a QP ends that another one may correct."""
+
+_SETTLED = Code.NOT_PROVEN, Code.TOO_NEAR, Code.OFF_CURVE
+"""How a call ends whose answer was settled, but is no step yet."""
 
 _WANTING = Code.ASKS, Code.CROWDED
 """How a call ends that is to be answered, and goes on then."""
@@ -129,10 +133,10 @@ class Driver:
 
     _arrays: StepData
 
-    def __init__(self, setup: Setup, engine: FusedEngine, accuracy: Accuracy, separation: Separation) -> None:
+    def __init__(self, setup: Setup, solver: Stepper, accuracy: Accuracy, separation: Separation) -> None:
         self._setup, self._accuracy, self._separation = setup, accuracy, separation
-        self._solver, self._layout = engine.solver, engine.layout
-        self._work, self._known = self._solver.workspace, setup.arm.arithmetic()
+        self._solver, self._layout = solver, solver.layout
+        self._work, self._known = solver.workspace, setup.arm.arithmetic()
         self._started = False
         self._held: State | None = None
         self._watch: Watch | None = None
@@ -150,6 +154,7 @@ class Driver:
             or not work.is_ready
             or setup.carrier.carried
             or self._moves != (target.base is not None)
+            or (self._moves and not self._solver.corrects)
             or not target.path.is_straight(target.start, target.end)
         ):
             return None
@@ -178,6 +183,8 @@ class Driver:
             code = self._called(self._arrays.take)
         if code == Code.DONE:
             return self._passage(state, target)
+        if not self._solver.corrects and not (data.settled and code in _SETTLED):
+            return None
         if code in _AGAIN or code == Code.NOT_PROVEN:
             first = self._solver.led(is_settled=bool(data.settled))
             return self.corrected(state, target, Begun(first, first, self._rows(), data.reach), code)
@@ -207,13 +214,13 @@ class Driver:
 
     def corrected(self, state: State, target: Target, begun: Begun, code: int) -> Taken:
         """Return the step by further QPs after the first one, which ended with `code`; its beginning if unusual."""
-        first, covered = begun.first, 1.0
-        if code == Code.NOT_PROVEN:
+        first, covered, work = begun.first, 1.0, self._work
+        if code == Code.NOT_PROVEN or not isinstance(work, FusedWorkspace):
             return begun
         for qps in range(2, MOST_QPS + 1):
             if qps > FREE_QPS and covered == 1.0 and is_cut_short(self._setup, first):
                 covered = first.progress
-                self._cut(target.part(covered), first)
+                self._cut(work, target.part(covered), first)
             self._solver.draw(state.control_vertices, None)
             code = self._called(self._arrays.correct)
             found = self._passage(state, target) if code == Code.DONE else None
@@ -221,26 +228,28 @@ class Driver:
                 progress = covered * found.progress
                 return Passage(found.state, progress, found.gap, first.solution, begun.rows, qps)
             if code not in _AGAIN:
-                return self._left(target, begun, qps, covered, code)
+                return self._left(work, target, begun, qps, covered, code)
         return Lost(first.solution, begun.rows)
 
-    def _left(self, target: Target, begun: Begun, qps: int, covered: float, code: int) -> Begun | Denied:
+    def _left(
+        self, work: FusedWorkspace, target: Target, begun: Begun, qps: int, covered: float, code: int
+    ) -> Begun | Denied:
         """Return what is left to an attempt after QPs of which the last ended with `code`: a proof, or that QP."""
-        first, work = begun.first, self._work
+        first = begun.first
         if code == Code.NOT_PROVEN:
             move = self._solver.led(is_settled=True)
         else:
             # Where the QP before it led, as far as this one knows.
-            q, vertices, progress = (work.condense.inputs[k].copy() for k in (0, 3, 7))
+            q, vertices, progress = (work.inputs[k].copy() for k in (0, 3, 7))
             torsion = first.torsion if work.curve is None else work.curve.inputs[1].copy()
             at = q.reshape(work.shape), vertices.reshape(-1, 3), torsion
             move, qps = Move(first.solution, *at, float(progress[0]), 0.0, None), qps - 1
         begun = begun._replace(move=move, reach=self._arrays.data.reach, qps=qps, covered=covered)
         return _corrects_nothing(target, begun, self._rows()) if code == Code.INFEASIBLE else begun
 
-    def _cut(self, target: Target, first: Move) -> None:
+    def _cut(self, work: FusedWorkspace, target: Target, first: Move) -> None:
         """Go back to where the `first` answer led, at the end of the `target`."""
-        work, inputs = self._work, self._work.condense.inputs
+        inputs = work.inputs
         goal = target.goal(1.0).over(target.end - target.start)
         work.started[:], work.started_points[:] = first.q.reshape(-1), first.vertices.reshape(-1)
         work.started_torsions[:] = first.torsion
@@ -251,7 +260,7 @@ class Driver:
 
     def _load(self, state: State, target: Target, share: float) -> None:
         """Write the step's state, goal and boxes."""
-        data, inputs, monitor = self._arrays.data, self._work.condense.inputs, self._setup.monitor
+        data, inputs, monitor = self._arrays.data, self._work.inputs, self._setup.monitor
         goal = target.goal(0.0).over(target.end - target.start)
         self._solver.draw(state.control_vertices, target.vertex_goals)
         if self._layout.general is not None:

@@ -28,6 +28,7 @@ from vgtm_qp.qp.numbers import StepNumbers, norm
 from vgtm_qp.qp.residual import AnswerError, FailedStepError, InfeasibleStepError
 from vgtm_qp.qp.settle import LEFT, MOST_STEPS, SETTLING_STEPS, Gain, enough_tip_error, held, missing_function
 from vgtm_qp.qp.solvers import StepSolver
+from vgtm_qp.qp.stepper import Stepper
 from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.closing import Closing
 from vgtm_qp.step.target import QPInput, Target
@@ -46,6 +47,11 @@ class Engine(ABC):
 
     def __init__(self, layout: Layout) -> None:
         self.layout = layout
+
+    @property
+    def stepper(self) -> Stepper | None:
+        """What solves its QPs in whole steps by C, if anything does."""
+        return None
 
     def qp(self, asked: QPInput) -> StepQP:
         """Return the whole QP of an input, every row and column with a name, in new arrays."""
@@ -314,6 +320,11 @@ class FusedEngine(Engine):
     def _plain(self) -> GeneralEngine:
         solver = CondensedSolver(self.layout, self.solver.solver)
         return GeneralEngine(self.layout, self._kinematics, self._task, solver, compiled=False)
+
+    @property
+    def stepper(self) -> Stepper:
+        """See :class:`Engine`."""
+        return self.solver
 
     @property
     def is_ready(self) -> bool:

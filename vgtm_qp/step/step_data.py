@@ -14,9 +14,9 @@ from vgtm_qp.geometry.groups import Scene
 from vgtm_qp.geometry.watch import AHEAD
 from vgtm_qp.native import Program
 from vgtm_qp.qp.answer import Accuracy
-from vgtm_qp.qp.fused import FusedWorkspace
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.residual import TOLERANCE
+from vgtm_qp.qp.stepper import Workspace
 from vgtm_qp.rows.tip import axes
 from vgtm_qp.step.acceptance import LOOSER, ROUNDING
 from vgtm_qp.step.separation import MOST_PIECES
@@ -69,7 +69,7 @@ class StepData:
         self,
         setup: Setup,
         layout: Layout,
-        work: FusedWorkspace,
+        work: Workspace,
         known: Arithmetic,
         accuracy: Accuracy,
         **given: Any,
@@ -96,7 +96,7 @@ class StepData:
         self.points: Array | None = None if known.ends is None else of_points["points"]
         self.take, self.resume, self.correct = map(self.program.entry, ("take", "resume", "correct"))
         self.program.set(
-            fused=work.address,
+            **work.structures,
             moves=int(moves),
             based_q=self.based_q,
             based_nodes=self.based_nodes,

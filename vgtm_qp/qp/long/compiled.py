@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from vgtm_qp.arrays import Array
+from vgtm_qp.arrays import Array, Index
 from vgtm_qp.compiled import Kernel
-from vgtm_qp.native import Code, Program, building
+from vgtm_qp.native import Code, CompiledKernel, Program, building
 from vgtm_qp.qp.answer import Accuracy, Closed, Move, StepSolution
 from vgtm_qp.qp.daqp import DAQP
-from vgtm_qp.qp.fused import daqp_addresses
+from vgtm_qp.qp.fused import daqp_addresses, placement
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.linearise import StepInput
 from vgtm_qp.qp.long.chain_data import ChainData, frame_constants_of, period_values
@@ -32,6 +33,7 @@ from vgtm_qp.qp.settle import (
     enough_length,
     enough_tip_error,
 )
+from vgtm_qp.qp.stepper import NearRows
 
 _ROOM, _NEAR, _SLOTS = 64, 64, 4
 """Capacity at first: rows of the dense QP, rows of clearance, and nodes of each of these."""
@@ -40,14 +42,18 @@ _NOWHERE: Array = np.zeros((0, 3))
 
 
 class CompiledChain:
-    """Takes the steps of a solver's arm by C once its functions are compiled, if the dense QPs are for DAQP."""
+    """Takes the steps of a solver's arm by C once its functions are compiled, if the dense QPs are for DAQP.
+
+    It is the :class:`~vgtm_qp.qp.stepper.Stepper` of that arm, and its workspace.
+    """
 
     def __init__(self, solver: ChainSolver) -> None:
         self._solver = solver
-        self._layout, self._chain = solver.layout, solver.chain
+        self.layout, self._chain = solver.layout, solver.chain
+        self.shape, self.torsions = solver.layout.arm.home_configuration.shape, np.zeros(0)
         self._begin, self._missing = (
-            begin_function(self._layout).kernel(),
-            missing_tip_function(self._layout).kernel(),
+            begin_function(self.layout).kernel(),
+            missing_tip_function(self.layout).kernel(),
         )
         self._given = solver.functions()
         self._functions = {name: Kernel(function) for name, function in self._given.items()}
@@ -83,43 +89,93 @@ class CompiledChain:
         The goal moves straight, and the base is at rest. The move has a closed configuration if all is exact; otherwise
         the second result says how far settling came, its error infinite if it does not count.
         """
-        if accuracy is not self._accuracy:
-            self._aim(accuracy)
+        self.aim(accuracy)
         self._load(asked)
         self._take(clearance)
         code = Code.CROWDED
         while code == Code.CROWDED:
             self._points[:] = asked.vertices.reshape(-1)
-            self._q[:] = asked.q
+            self._q[:] = self._begun[:] = asked.q
             code = self._program.call("chain_move", TOLERANCE)
             if code == Code.CROWDED:
-                self.reserve(2 * self._room)
+                self._widen(2 * self._room)
         if code not in (Code.DONE, Code.UNSETTLED, Code.OFF_CURVE):
             return None
-        data, count, near = self._program.data, self._strokes_at + len(self._x), len(clearance)
-        solution = StepSolution(
+        error = np.inf if code == Code.UNSETTLED else self._program.data.error
+        return self.led(is_settled=code == Code.DONE), self._closed(error)
+
+    def answered(self) -> StepSolution:
+        """See :class:`~vgtm_qp.qp.stepper.Stepper`."""
+        data, count = self._program.data, self._strokes_at + len(self._x)
+        return StepSolution(
             nodes=_NOWHERE,
             actuators=self._x.copy(),
             vertices=_NOWHERE,
             progress=data.step,
             actuator_multipliers=self._y.copy(),
-            clearance_multipliers=-self._every[count : count + near],
+            clearance_multipliers=-self._every[count : count + data.near],
             iterations=data.iterations,
         )
-        turned = self._missing.outputs[2].reshape(3, 3).T.copy()
-        error = np.inf if code == Code.UNSETTLED else data.error
-        closed = Closed(
-            self._q.copy(), self._quantities.copy(), error, self._missing.outputs[1].copy(), turned
-        )
-        points, torsion = self._points.reshape(-1, 3).copy(), np.zeros(0)
-        settled = closed if code == Code.DONE else None
-        begun = self._begun.copy()
-        begun[self._layout.arm.base] = asked.q[self._layout.arm.base]
-        return Move(solution, begun, points, torsion, data.reached, data.furthest, settled), closed
 
-    def _aim(self, accuracy: Accuracy) -> None:
-        """Settle to that `accuracy` from now on."""
-        home, self._accuracy = self._layout.arm.home_configuration, accuracy
+    def led(self, *, is_settled: bool) -> Move:
+        """See :class:`~vgtm_qp.qp.stepper.Stepper`."""
+        data, points = self._program.data, self._points.reshape(-1, 3).copy()
+        closed = self._closed(data.error) if is_settled else None
+        way = self._begun.copy(), points, np.zeros(0), data.reached, data.furthest
+        return Move(self.answered(), *way, closed)
+
+    def _closed(self, error: float) -> Closed:
+        """Return the configuration at which settling ended."""
+        _, position, rotation = self._missing.outputs
+        turned = rotation.reshape(3, 3).T.copy()
+        return Closed(self._q.copy(), self._quantities.copy(), error, position.copy(), turned)
+
+    @property
+    def workspace(self) -> CompiledChain:
+        """See :class:`~vgtm_qp.qp.stepper.Stepper`."""
+        return self
+
+    @property
+    def corrects(self) -> bool:
+        """See :class:`~vgtm_qp.qp.stepper.Stepper`; NumPy may settle what C does not."""
+        return False
+
+    @property
+    def structures(self) -> dict[str, int]:
+        """See :class:`~vgtm_qp.qp.stepper.Workspace`."""
+        return {"fused": self._step.address, "chain": self._program.address}
+
+    @property
+    def data(self) -> Any:
+        """See :class:`~vgtm_qp.qp.stepper.Workspace`."""
+        return self._step.data
+
+    @property
+    def inputs(self) -> Sequence[Array]:
+        """See :class:`~vgtm_qp.qp.stepper.Workspace`."""
+        return self._inputs
+
+    def refresh(self) -> None:
+        """See :class:`~vgtm_qp.qp.stepper.Workspace`; all functions were compiled before."""
+
+    def reserve(self, near: int, slots: int) -> None:
+        """See :class:`~vgtm_qp.qp.stepper.Workspace`; with more of these the dense QP may have more rows as well."""
+        if not self._rows.hold(near, slots):
+            self._make_room(max(near, self._rows.near), max(slots, self._rows.slots))
+            self._widen(2 * self._room)
+
+    def near(self, count: int) -> tuple[Index, Array, Array]:
+        """See :class:`~vgtm_qp.qp.stepper.Workspace`."""
+        return self._rows.read(count, self.data.slots)
+
+    def bend(self, torsion: Array, base_frame: Array) -> None:
+        """See :class:`~vgtm_qp.qp.stepper.Stepper`; constant tables describe the curve."""
+
+    def aim(self, accuracy: Accuracy) -> None:
+        """See :class:`~vgtm_qp.qp.stepper.Stepper`."""
+        if accuracy is self._accuracy:
+            return
+        home, self._accuracy = self.layout.arm.home_configuration, accuracy
         self._program.set(
             member_error=accuracy.member,
             tip_error=accuracy.tip,
@@ -130,35 +186,38 @@ class CompiledChain:
 
     def _load(self, asked: StepInput) -> None:
         """Write the state, the goal and the boxes."""
-        layout, inputs = self._layout, self._begin.inputs
+        layout, inputs = self.layout, self._begin.inputs
         self._at[:], self._lower[:], self._upper[:] = asked.at, asked.lower, asked.upper
-        self._pull[:] = 0.0
         if layout.vertices:
             inputs[2][:] = asked.q[layout.arm.stations.nodes[0]].reshape(-1)
-            if asked.motion:
-                self._pull[:] = layout.vertex_gradient(asked.vertices, asked.vertex_goals)
+        self._pull[:] = 0.0
+        if asked.motion:
+            self.draw(asked.vertices, asked.vertex_goals)
         goal = asked.goal
         inputs[4][:], inputs[5][:] = goal.position, goal.rotation.T.reshape(-1)
         inputs[6][:], inputs[7][:] = goal.velocity, goal.spin
         inputs[8][0], inputs[9][0] = asked.motion, asked.progress
 
+    def draw(self, vertices: Array, goals: Array | None) -> None:
+        """See :class:`~vgtm_qp.qp.stepper.Stepper`."""
+        if self.layout.vertices:
+            self._pull[:] = self.layout.vertex_gradient(vertices, goals)
+
     def _take(self, clearance: ClearanceRows) -> None:
         """Write the rows of clearance."""
         near, slots = clearance.nodes.shape
         data = self._program.data
-        if near > self._near or slots > self._slots:
-            self._make_room(max(2 * near, self._near), max(slots, self._slots))
+        if not self._rows.hold(near, slots):
+            self._make_room(max(2 * near, self._rows.near), max(slots, self._rows.slots))
         data.near = near
         if near:
             if data.slots != slots:
                 data.pressing, data.slots = 0, slots
-            self._near_nodes[: near * slots] = clearance.nodes.reshape(-1)
-            self._near_rows[: 3 * near * slots] = clearance.coefficients.reshape(-1)
-            self._near_lower[:near] = clearance.lower
+            self._rows.write(clearance)
 
     def _start(self) -> None:
         """Allocate the arrays, and give their addresses to C."""
-        layout, arm = self._layout, self._layout.arm
+        layout, arm = self.layout, self.layout.arm
         self._program = program = Program("Chain")
         self._q, self._at, self._begun = (np.zeros(arm.home.shape) for _ in range(3))
         self._points, self._pull = self._begin.inputs[3], np.zeros((layout.vertices, 3))
@@ -193,24 +252,51 @@ class CompiledChain:
         program.set(**sizes, **_constants(solver, data), **_tolerances(layout), **products(solver, sizes))
         self._strokes_at = sizes["tips"] + sizes["held"] + sizes["ends"] + 1 + sizes["legs"]
         program.set(**_workspace(sizes, self._given))
-        self._near = self._slots = 0
+        self._begin_steps()
         self._make_room(_NEAR, _SLOTS)
-        self.reserve(_ROOM)
+        self._widen(_ROOM)
+
+    def _begin_steps(self) -> None:
+        """Give C the input and the places of the answer in the order of a short arm's QP, see ``step.c``."""
+        layout, base, begin = self.layout, np.zeros(self._q.size), self._begin.inputs
+        if layout.vertices:
+            # The base rests at home, wherever this is called.
+            begin[2][:] = layout.arm.home[layout.arm.stations.nodes[0]].reshape(-1)
+        state = self._q.reshape(-1), self._at.reshape(-1), base, self._points
+        self._inputs = [*state, self._lower, self._upper, *begin[8:10], *begin[4:8]]
+        self._step, values = Program("Fused"), [self._quantities] * 2
+        self._addresses = [
+            np.array([array.ctypes.data for array in arrays], dtype=np.uintp)
+            for arrays in (self._inputs, values)
+        ]
+        arguments, results = (addresses.ctypes.data for addresses in self._addresses)
+        self._step.set(
+            condense=CompiledKernel(arg=arguments),
+            close=CompiledKernel(res=results),
+            missing=self._missing,
+            q=self._q,
+            points=self._points,
+            started=self._begun,
+            started_points=self._points,
+            gone=self._missing.inputs[5],
+            progress=begin[9],
+            velocity=begin[6],
+            spin=begin[7],
+            work=np.zeros(self._q.size),
+            **placement(layout),
+        )
 
     def _make_room(self, near: int, slots: int) -> None:
         """Make room for `near` rows of clearance over `slots` nodes each."""
-        self._near, self._slots = near, slots
-        self._near_nodes = np.zeros(near * slots, dtype=np.int32)
-        self._near_rows, self._near_lower = np.zeros(3 * near * slots), np.zeros(near)
+        self._rows = NearRows(near, slots)
+        self._step.set(**self._rows.fields)
         total = self._strokes_at + len(self._x) + near
         self._every = np.zeros(total)
         rows = {name: np.zeros(total) for name in ("low", "high", "value", "out")}
         marks = {name: np.zeros(total, dtype=np.int32) for name in ("state", "remembered")}
         pressed = np.zeros(near * slots, dtype=np.int32)
         self._program.set(
-            near_nodes=self._near_nodes,
-            near_rows=self._near_rows,
-            near_lower=self._near_lower,
+            **self._rows.fields,
             every=self._every,
             pressed=pressed,
             pressing=0,
@@ -219,7 +305,7 @@ class CompiledChain:
             **marks,
         )
 
-    def reserve(self, room: int) -> None:
+    def _widen(self, room: int) -> None:
         """Make room for that many rows in the dense QP."""
         data, self._room = self._program.data, room
         size = data.periods * data.freedom + data.curve + 1
