@@ -157,7 +157,7 @@ def test_whole_maneuvers_by_c_and_by_numpy(tracking, monkeypatch):
 def test_room_for_rows_grows(rng):
     """Of many rows that press, all are kept: the dense QP grows."""
     layout, engine = make_engine("octahedral", vertices=5, hard=False)
-    engine.compiled.reserve(4)
+    engine.compiled.widen(4)
     asked = make_asked(layout, 1, rng)
     wanted = moved_by(engine, asked, Engine.move)
     assert isinstance(wanted, Move)

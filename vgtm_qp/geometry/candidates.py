@@ -16,7 +16,7 @@ from vgtm_qp.geometry.shapes import GeometryError
 Motion = tuple[Displacement, Displacement, Displacement]
 """Displacements from the references of the three lists."""
 
-_TO_PIECES, _RIGID, _BENDING = range(3)
+TO_PIECES, _RIGID, _BENDING = range(3)
 
 _FEW_PAIRS = 20_000
 """Greatest number of pairs of a scene that lists all of them."""
@@ -80,7 +80,7 @@ class Candidates:
     def forget_pieces(self) -> None:
         """Forget the pairs with pieces, because the pieces are others now; pairs of bodies are kept."""
         if self._lists:
-            pairs = self._lists[_TO_PIECES]
+            pairs = self._lists[TO_PIECES]
             pairs.renew([], pairs.reference, pairs.time, -np.inf)
 
     def cover(
@@ -132,7 +132,7 @@ class Candidates:
     def _renew_pieces(self, X: Array, time: float, horizon: float) -> None:
         """List the pairs of a body and a piece that are nearer than `horizon`, m, at `X`, the new reference."""
         groups = _groups_with_pieces(X, self._scene, time, horizon)
-        self._lists[_TO_PIECES].renew(groups, X, time, horizon if len(self._scene.pieces) else np.inf)
+        self._lists[TO_PIECES].renew(groups, X, time, horizon if len(self._scene.pieces) else np.inf)
 
     def renew_bodies(self, X: Array, time: float, horizon: float) -> None:
         """List the pairs of two bodies that are nearer than `horizon`, m, at `X`, the new reference."""
@@ -239,7 +239,7 @@ class Candidates:
 
     def beyond(self, motion: Motion) -> tuple[float, float]:
         """Return lower bounds, m, of the distances of the pairs not listed: to pieces, and between bodies."""
-        far = self._lists[_TO_PIECES].horizon - motion[_TO_PIECES].greatest
+        far = self._lists[TO_PIECES].horizon - motion[TO_PIECES].greatest
         if not self._scene.has_self:
             return far, np.inf
         return far, min(self.apart(motion))

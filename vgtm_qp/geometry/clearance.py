@@ -28,8 +28,7 @@ class Clearance:
     """Distances of an arm's bodies from obstacles and from each other; one thread at a time.
 
     Positions ``X`` (P, 3), m, are those of the points that ``Bodies.points`` indexes. Lists of pairs that may be near
-    are kept from one call to the next. Scenes without meshes and hulls are also watched, which is faster for the states
-    of a motion.
+    are kept from one call to the next. Scenes without meshes and hulls are also watched, which is faster.
 
     Parameters
     ----------

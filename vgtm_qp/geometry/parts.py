@@ -23,10 +23,12 @@ class Parts:
 
     Attributes
     ----------
-    of : (B,) int
-        The part of each body.
     near : (K, 2) int
         Pairs of parts that are near, among them each part with itself.
+    points, starts : 1-D int, (parts,) int
+        The points of each part, part after part, and where these begin.
+    thickness : (parts,)
+        Greatest radius of a body of each, m.
     beyond : float
         Lower bound of the distances of parts that are not near, at the positions of :meth:`update_beyond`, m.
     """
@@ -34,16 +36,16 @@ class Parts:
     def __init__(self, bodies: Bodies, X: Array, horizon: float) -> None:
         tree = cKDTree(X[bodies.points].mean(axis=1), leafsize=BODIES)
         first = _leaves(tree.tree)
-        self.of = np.empty(len(bodies), dtype=np.int64)
-        self.of[tree.indices] = np.searchsorted(first, np.arange(len(bodies)), side="right") - 1
+        self._of = np.empty(len(bodies), dtype=np.int64)
+        self._of[tree.indices] = np.searchsorted(first, np.arange(len(bodies)), side="right") - 1
         every = np.arange(len(first))
-        self._thickness = np.zeros(len(every))
-        np.maximum.at(self._thickness, self.of, bodies.radius)
+        self.thickness = np.zeros(len(every))
+        np.maximum.at(self.thickness, self._of, bodies.radius)
         # A point is in each part that has one of its bodies, once.
         span = bodies.points.shape[1]
-        points = np.unique(np.repeat(self.of, span) * len(X) + bodies.points.reshape(-1))
-        self._part, self._points = np.divmod(points, len(X))
-        self._start = np.searchsorted(self._part, every)
+        points = np.unique(np.repeat(self._of, span) * len(X) + bodies.points.reshape(-1))
+        self._part, self.points = np.divmod(points, len(X))
+        self.starts = np.searchsorted(self._part, every)
         self._horizon = self.beyond = horizon
         pairs, gaps = self._pairs(X)
         self.near = np.concatenate([np.stack([every, every], axis=1), pairs[gaps < horizon]])
@@ -51,28 +53,28 @@ class Parts:
 
     def among(self, chosen: Mask, first: Index, second: Index) -> Mask:
         """Return (K,) which pairs of bodies are in the pairs of parts that `chosen` picks from `near`."""
-        return np.isin(self._codes_of(self.of[first], self.of[second]), self._codes[chosen])
+        return np.isin(self._codes_of(self._of[first], self._of[second]), self._codes[chosen])
 
     def _codes_of(self, first: Index, second: Index) -> Index:
         """Return (K,) a number for each pair of parts, the same in either order."""
-        return np.asarray(np.minimum(first, second) * len(self._start) + np.maximum(first, second))
+        return np.asarray(np.minimum(first, second) * len(self.starts) + np.maximum(first, second))
 
     def inside(self, parts: Index) -> tuple[Index, Index]:
         """Return the bodies of some parts, and the points that span these."""
-        return np.flatnonzero(np.isin(self.of, parts)), np.unique(self._points[np.isin(self._part, parts)])
+        return np.flatnonzero(np.isin(self._of, parts)), np.unique(self.points[np.isin(self._part, parts)])
 
     def _balls(self, vectors: Array) -> tuple[Array, Array]:
         """Return centers (K, 3) and radii (K,) of balls round the vectors (P, 3) of the points of each part."""
-        own = vectors.take(self._points, axis=0)
-        center = np.add.reduceat(own, self._start, axis=0) / np.bincount(self._part)[:, None]
+        own = vectors.take(self.points, axis=0)
+        center = np.add.reduceat(own, self.starts, axis=0) / np.bincount(self._part)[:, None]
         own -= center.take(self._part, axis=0)
-        square = np.maximum.reduceat(np.einsum("kc,kc->k", own, own), self._start)
+        square = np.maximum.reduceat(np.einsum("kc,kc->k", own, own), self.starts)
         return center, np.sqrt(square)
 
     def _pairs(self, X: Array) -> tuple[Index, Array]:
         """Return pairs of parts (K, 2), among them all nearer than the horizon at `X`, and their distances (K,), m."""
         center, radius = self._balls(X)
-        radius += self._thickness
+        radius += self.thickness
         reach = 2.0 * float(radius.max()) + self._horizon
         pairs = cKDTree(center).query_pairs(reach, output_type="ndarray").astype(np.int64)
         first, second = pairs.T

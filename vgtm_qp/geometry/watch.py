@@ -19,7 +19,7 @@ import numpy as np
 from vgtm_qp.arrays import Array
 from vgtm_qp.compiled import Compiling, Kernel, compiler
 from vgtm_qp.errors import EvaluationError
-from vgtm_qp.geometry.candidates import Candidates
+from vgtm_qp.geometry.candidates import TO_PIECES, Candidates
 from vgtm_qp.geometry.exact import CONTACT, WIDTH, follow_function, proof_function
 from vgtm_qp.geometry.formulas import FAR, FURTHEST
 from vgtm_qp.geometry.groups import Found, Group, Scene
@@ -33,6 +33,9 @@ AHEAD = 1.2
 
 _AMPLE = 1.3
 """Least bound of the distances of pairs that are not listed, over the distance below which pairs are evaluated."""
+
+_RIGID = 11
+"""Numbers of the motion of a part of the arm in C."""
 
 _NEXT = 2.0
 """If no pair is near: distance below which pairs are still evaluated, in one call, over the limit."""
@@ -288,7 +291,10 @@ class Watch:
         way = self._way
         if way is None or way.data.lost:
             return self._start(X, time)
-        (far, self_far), (needed, self_needed) = self._far(way), self._needed(way)
+        needed, self_needed = self._needed(way)
+        if way.data.parted < self_needed:
+            way.call("measure_parts")
+        far, self_far = self._far(way)
         # NaN fails the comparisons.
         if not (far >= needed and self_far >= self_needed):
             self._list(way, X, time)
@@ -318,7 +324,7 @@ class Watch:
             place=self._place,
             time=self._clock(time),
             fastest=self._scene.pieces.fastest,
-            neighbours=0,
+            parts=0,
             **dict.fromkeys(("reach", "self_reach", "wanted", "self_wanted"), -np.inf),
             **dict.fromkeys(("self_far", "parted"), np.inf),
         )
@@ -330,28 +336,25 @@ class Watch:
         """Go to a state, and list the pairs there that may be near soon."""
         if self._renewals and not self._is_there(X, time):
             self._go(np.stack([self._place, X]), way.data.time, time, -np.inf, -np.inf)
-        candidates, at = self._candidates, self._clock(time)
-        needed, self_needed = self._needed(way)
-        motion = candidates.cover(X, at, max(needed, 0.0), max(self_needed, 0.0))
+        candidates, data, began = self._candidates, way.data, bool(self._renewals)
+        (_, self_far), (needed, self_needed) = self._far(way), self._needed(way)
+        # What C knows of pairs of bodies is more: those that moved together came no nearer.
+        is_short = not (began and self_far >= self_needed)
+        reaches = max(needed, 0.0), max(self_needed, 0.0) if is_short else -np.inf
+        motion = candidates.cover(X, self._clock(time), *reaches)
         before, self._renewals = self._renewals or [0] * len(candidates.renewals), candidates.renewals
         renewed = [place for place, count in enumerate(self._renewals) if count != before[place]]
         way.set(far=candidates.beyond(motion)[0])
         parts = candidates.parts
         if parts is not None:
             near, parted = candidates.apart(motion)
-            # What C knows of near parts, which moved together, may be more; of lists that it has.
-            way.set(self_far=near if any(renewed) else max(near, way.data.self_far), parted=parted)
+            if any(place != TO_PIECES for place in renewed):
+                way.set(self_far=near, parted=parted)
+            elif began:
+                way.set(self_far=max(near, data.self_far), parted=max(parted, data.parted))
         if parts is not None and parts is not self._parts:
             self._parts = parts
-            way.set(
-                parts=len(size := np.bincount(parts.of)),
-                size=size.astype(np.int32),
-                part=parts.of.astype(np.int32),
-                neighbours=0 if near >= 0.5 * FAR else len(parts.near),
-                neighbour=np.ascontiguousarray(parts.near, dtype=np.int32),
-                shift=np.zeros((len(size), 3)),
-                bent=np.zeros(len(size)),
-            )
+            self._part(way, parts, all_listed=near >= 0.5 * FAR)
         if renewed:
             kept = [pairs for pairs in self.groups if pairs.group.place not in renewed]
             new = [
@@ -361,6 +364,25 @@ class Watch:
             ]
             self._hold([*new, *kept])
             way.set(reach=-np.inf, self_reach=-np.inf)
+
+    def _part(self, way: Program, parts: Parts, *, all_listed: bool) -> None:
+        """Give C the parts of the arm, unless all pairs of bodies are listed."""
+        first, second = np.sort(parts.near, axis=1).T
+        order = np.lexsort((second, first))
+        count = len(parts.starts)
+        ends = np.searchsorted(first[order], np.arange(count + 1))
+        tables = {
+            "part_points": parts.points,
+            "points_at": np.append(parts.starts, len(parts.points)),
+            "neighbour": second[order],
+            "neighbours_at": ends,
+        }
+        way.set(
+            parts=0 if all_listed else count,
+            thickness=parts.thickness,
+            part=np.zeros((count, _RIGID)),
+            **{name: np.ascontiguousarray(table, dtype=np.int32) for name, table in tables.items()},
+        )
 
     def _watched(self, group: Group, lower: Array) -> WatchedGroup:
         """Return what watches the pairs of `group`; kernels of a list's shape are set up once."""

@@ -39,6 +39,10 @@ typedef struct {
     double *contacts;                    /* (2 C, 9): two for each */
 } Pairs;
 
+/* The motion of a part of an arm: displacement of its centre, turn, and how far points leave that motion; the centre, and
+   how far points are from it. */
+typedef struct { double centre[3], shift[3], turn[3], off, reach; } Rigid;
+
 /* The path of an arm in straight pieces, each from one place of all its points to the next. */
 typedef struct {
     int pieces, points, bodies, groups;
@@ -53,12 +57,13 @@ typedef struct {
     double *place, time;             /* (P, 3), s: the present ones, where pairs nearer than the reach are evaluated */
     double reach, self_reach, wanted, self_wanted;    /* wanted: the reach of the next place */
     /* Lower bounds of the distances of pairs that no group has: from pieces, the fastest of which has that speed, m/s;
-       between bodies in parts of the arm that are near to each other, and in others. Number of bodies of each part, the
-       part of each body, and pairs of near parts, each with itself among them. */
+       between bodies in parts of the arm that are near to each other, and in others. The points of each part, and where
+       they begin; the greatest radius of its bodies; the later parts that it is near to, itself the first of them. */
     double far, self_far, parted, fastest;
-    int parts, neighbours;
-    const int *size, *part, *neighbour;    /* (parts), (B), (neighbours, 2) */
-    double *shift, *bent;                  /* (parts, 3), (parts): ball of the displacements of a part's bodies */
+    int parts;
+    const int *part_points, *points_at, *neighbour, *neighbours_at;
+    const double *thickness;
+    Rigid *part;                           /* (parts) */
     int lost;                        /* whether a pair had no value, so that nothing is known of any */
 
     double *middle, *turned, *moved; /* (B, 3), (B), (B): of each axis in the present piece the displacement
@@ -92,25 +97,122 @@ static void displace(Way *w, const double *before, const double *after)
     }
 }
 
-/* How much nearer two bodies of near parts came in the present piece at most: moving together they do not. */
-static double bending(Way *w)
+/* a + b x c. */
+static void add_cross(const double *a, const double *b, const double *c, double *sum)
+{
+    for (int i = 0; i < 3; i++) {
+        int j = (i + 1) % 3, k = (i + 2) % 3;
+        sum[i] = a[i] + b[j] * c[k] - b[k] * c[j];
+    }
+}
+
+/* The solution of A x = b for a symmetric A (xx, xy, xz, yy, yz, zz), or zero. */
+static void solve_symmetric(const double *A, const double *b, double *x)
+{
+    double xx = A[3] * A[5] - A[4] * A[4], xy = A[2] * A[4] - A[1] * A[5], xz = A[1] * A[4] - A[2] * A[3];
+    double yy = A[0] * A[5] - A[2] * A[2], yz = A[1] * A[2] - A[0] * A[4], zz = A[0] * A[3] - A[1] * A[1];
+    double determinant = A[0] * xx + A[1] * xy + A[2] * xz, inverse = determinant > 0.0 ? 1.0 / determinant : 0.0;
+    x[0] = inverse * (xx * b[0] + xy * b[1] + xz * b[2]);
+    x[1] = inverse * (xy * b[0] + yy * b[1] + yz * b[2]);
+    x[2] = inverse * (xz * b[0] + yz * b[1] + zz * b[2]);
+}
+
+/* Write the centre of part k at a place, and how far its points are from it. */
+static void place_part(const Way *w, int k, const double *place)
+{
+    Rigid *part = w->part + k;
+    const int *first = w->part_points + w->points_at[k], *last = w->part_points + w->points_at[k + 1];
+    double square = 0.0, *centre = part->centre;
+    centre[0] = centre[1] = centre[2] = 0.0;
+    for (const int *p = first; p < last; p++)
+        for (int a = 0; a < 3; a++) centre[a] += place[3 * *p + a] / (double)(last - first);
+    for (const int *p = first; p < last; p++) square = fmax(square, square_of(centre, place + 3 * *p));
+    part->reach = sqrt(square);
+}
+
+/* Write the motion of part k from one place to another: the turn of least squares, about an axis that may be undetermined. */
+static void move_part(const Way *w, int k, const double *before, const double *after)
+{
+    Rigid *part = w->part + k;
+    const int *first = w->part_points + w->points_at[k], *last = w->part_points + w->points_at[k + 1];
+    double inertia[6] = {0.0}, moment[3] = {0.0}, square = 0.0;
+    place_part(w, k, before);
+    memset(part->shift, 0, sizeof(part->shift));
+    for (const int *p = first; p < last; p++)
+        for (int a = 0; a < 3; a++) part->shift[a] += (after[3 * *p + a] - before[3 * *p + a]) / (double)(last - first);
+    for (const int *p = first; p < last; p++) {
+        double r[3], moved[3];
+        for (int a = 0; a < 3; a++) {
+            r[a] = before[3 * *p + a] - part->centre[a];
+            moved[a] = after[3 * *p + a] - before[3 * *p + a];
+        }
+        add_cross(moment, r, moved, moment);
+        inertia[0] += r[1] * r[1] + r[2] * r[2];
+        inertia[1] -= r[0] * r[1];
+        inertia[2] -= r[0] * r[2];
+        inertia[3] += r[0] * r[0] + r[2] * r[2];
+        inertia[4] -= r[1] * r[2];
+        inertia[5] += r[0] * r[0] + r[1] * r[1];
+    }
+    double more = 1e-9 * (inertia[0] + inertia[3] + inertia[5]);
+    for (int i = 0; i < 3; i++) inertia[i == 0 ? 0 : i == 1 ? 3 : 5] += more;
+    solve_symmetric(inertia, moment, part->turn);
+    for (const int *p = first; p < last; p++) {
+        double r[3], by[3], moved[3];
+        for (int a = 0; a < 3; a++) {
+            r[a] = before[3 * *p + a] - part->centre[a];
+            moved[a] = after[3 * *p + a] - before[3 * *p + a];
+        }
+        add_cross(part->shift, part->turn, r, by);
+        square = fmax(square, square_of(by, moved));
+    }
+    part->off = sqrt(square);
+}
+
+/* How much nearer two bodies of near parts come at most on the straight way from one place to another. With any w, two
+   points r apart that move by w x r + d against each other come no nearer than |d|: w x r leads away. */
+static double bending(const Way *w, const double *before, const double *after)
 {
     double most = 0.0;
-    memset(w->shift, 0, sizeof(double) * 3 * w->parts);
-    memset(w->bent, 0, sizeof(double) * w->parts);
-    for (int b = 0; b < w->bodies; b++)
-        for (int a = 0; a < 3; a++) w->shift[3 * w->part[b] + a] += w->middle[3 * b + a] / w->size[w->part[b]];
-    for (int b = 0; b < w->bodies; b++) {
-        int p = w->part[b];
-        double off = sqrt(square_of(w->middle + 3 * b, w->shift + 3 * p)) + w->turned[b];
-        w->bent[p] = fmax(off, w->bent[p]);
-    }
-    for (int k = 0; k < w->neighbours; k++) {
-        int p = w->neighbour[2 * k], q = w->neighbour[2 * k + 1];
-        double change = sqrt(square_of(w->shift + 3 * p, w->shift + 3 * q)) + w->bent[p] + w->bent[q];
-        most = fmax(change, most);
-    }
+    for (int k = 0; k < w->parts; k++) move_part(w, k, before, after);
+    for (int k = 0; k < w->parts; k++)
+        for (int n = w->neighbours_at[k]; n < w->neighbours_at[k + 1]; n++) {
+            const Rigid *p = w->part + k, *q = w->part + w->neighbour[n];
+            double apart[3], turn[3], shift[3], by[3], change = p->off + q->off;
+            for (int a = 0; a < 3; a++) {
+                apart[a] = q->centre[a] - p->centre[a];
+                turn[a] = 0.5 * (p->turn[a] + q->turn[a]);
+                shift[a] = q->shift[a] - p->shift[a];
+            }
+            add_cross((const double[3]){0.0, 0.0, 0.0}, turn, apart, by);
+            change += sqrt(square_of(by, shift)) + 0.5 * sqrt(square_of(p->turn, q->turn)) * (p->reach + q->reach);
+            most = fmax(change, most);
+        }
     return most;
+}
+
+/* Find how far bodies of parts that are not near to each other are apart at the present place. */
+EXPORT int measure_parts(Way *w)
+{
+    double least = INFINITY;
+    for (int k = 0; k < w->parts; k++) {
+        place_part(w, k, w->place);
+        w->part[k].reach += w->thickness[k];
+    }
+    for (int k = 0; k < w->parts; k++) {
+        const int *near = w->neighbour + w->neighbours_at[k], *last = w->neighbour + w->neighbours_at[k + 1];
+        for (int q = k; q < w->parts; q++) {
+            if (near < last && *near == q) {
+                near++;
+                continue;
+            }
+            double both = w->part[k].reach + w->part[q].reach;
+            double square = square_of(w->part[k].centre, w->part[q].centre);
+            if (least + both > 0.0 && square < (least + both) * (least + both)) least = sqrt(square) - both;
+        }
+    }
+    w->parted = least;
+    return DONE;
 }
 
 /* Replace points by where they are at a time from the piece of pair k: in a frame that moves with that, and is the
@@ -242,7 +344,7 @@ EXPORT int follow(Way *w)
         double greatest = greatest_of(w->moved, w->bodies);
         w->far -= greatest + w->fastest * fabs(w->until - w->since);
         w->parted -= 2.0 * greatest;
-        if (w->neighbours) w->self_far -= bending(w);
+        if (w->parts) w->self_far -= bending(w, before, after);
         double self_far = least_of(w->self_far, w->parted);
         if (!(w->far >= w->floor && self_far >= w->self_floor)) is_proven = 0;
         for (int g = 0; g < w->groups; g++) {

@@ -98,7 +98,7 @@ class CompiledChain:
             self._q[:] = self._begun[:] = asked.q
             code = self._program.call("chain_move", TOLERANCE)
             if code == Code.CROWDED:
-                self._widen(2 * self._room)
+                self.widen(2 * self._room)
         if code not in (Code.DONE, Code.UNSETTLED, Code.OFF_CURVE):
             return None
         error = np.inf if code == Code.UNSETTLED else self._program.data.error
@@ -162,7 +162,7 @@ class CompiledChain:
         """See :class:`~vgtm_qp.qp.stepper.Workspace`; with more of these the dense QP may have more rows as well."""
         if not self._rows.hold(near, slots):
             self._make_room(max(near, self._rows.near), max(slots, self._rows.slots))
-            self._widen(2 * self._room)
+            self.widen(2 * self._room)
 
     def near(self, count: int) -> tuple[Index, Array, Array]:
         """See :class:`~vgtm_qp.qp.stepper.Workspace`."""
@@ -254,7 +254,7 @@ class CompiledChain:
         program.set(**_workspace(sizes, self._given))
         self._begin_steps()
         self._make_room(_NEAR, _SLOTS)
-        self._widen(_ROOM)
+        self.widen(_ROOM)
 
     def _begin_steps(self) -> None:
         """Give C the input and the places of the answer in the order of a short arm's QP, see ``step.c``."""
@@ -305,7 +305,7 @@ class CompiledChain:
             **marks,
         )
 
-    def _widen(self, room: int) -> None:
+    def widen(self, room: int) -> None:
         """Make room for that many rows in the dense QP."""
         data, self._room = self._program.data, room
         size = data.periods * data.freedom + data.curve + 1
