@@ -155,6 +155,9 @@ class Watch:
 
     def __init__(self, scene: Scene, influence: float, self_influence: float) -> None:
         self._scene = scene
+        for shape in scene.shapes:
+            # A list may have pairs of a shape only later, within a step.
+            _contact(shape, compiler())[1].ask()
         self._candidates, self._most = Candidates(scene, influence, self_influence), AHEAD * influence
         self.groups: list[WatchedGroup] = []
         self._known: dict[tuple[int, str], WatchedGroup] = {}
