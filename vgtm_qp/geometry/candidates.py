@@ -18,8 +18,8 @@ Motion = tuple[Displacement, Displacement, Displacement]
 
 TO_PIECES, _RIGID, _BENDING = range(3)
 
-_FEW_PAIRS = 20_000
-"""Greatest number of pairs of a scene that lists all of them."""
+_FEW_PAIRS = 40_000
+"""Greatest number of bodies, times that of bodies and pieces, of a scene that lists all pairs."""
 
 _MOST_BENDING = 0.5
 """Share of bending pairs of parts above which all bodies are compared again."""

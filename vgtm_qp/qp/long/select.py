@@ -9,7 +9,7 @@ from vgtm_qp.qp.long.chain import find_chain
 from vgtm_qp.qp.long.staged import StagedSolver
 from vgtm_qp.qp.long.tracked import TrackedSolver
 
-STAGED_ACTUATORS = 70
+STAGED_ACTUATORS = 36
 """Least number of actuators with which elimination along the chain is faster than condensing onto the actuators."""
 
 
