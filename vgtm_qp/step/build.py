@@ -33,9 +33,9 @@ from vgtm_qp.qp.bays import BaySolver
 from vgtm_qp.qp.condensed import CondensedSolver
 from vgtm_qp.qp.fused import FusedSolver
 from vgtm_qp.qp.layout import Layout, with_angles
-from vgtm_qp.qp.long.select import STAGED_ACTUATORS, chain_solver, prefers_staged
+from vgtm_qp.qp.long.select import STAGED_ACTUATORS, chain_solver, prefers_staged, prefers_sweeps
 from vgtm_qp.qp.shape import CurveShape
-from vgtm_qp.qp.solvers import DEFAULT_SOLVER, available_solvers, dense_solver, make_solver
+from vgtm_qp.qp.solvers import DEFAULT_SOLVER, StepSolver, available_solvers, dense_solver, make_solver
 from vgtm_qp.qp.terms import Inequality, Objective, OwnTerms
 from vgtm_qp.rotation import rotation_from_vector
 from vgtm_qp.rows import curve as curve_rows
@@ -291,17 +291,21 @@ def make_engine(
     if layout.elastic_tip and not is_short:
         _LOG.warning(_CONDENSED_ALL_THE_SAME)
     is_quick = not plain and not layout.elastic_tip and not layout.own
+    is_long = is_quick and compiled and prefers_sweeps(layout)
+    along = chain_solver(layout, dense_solver(solver)) if is_long else None
+    if along is not None and ChainEngine.serves(along):
+        return ChainEngine(along, kinematics, task)
     if is_quick and is_short and layout.arm.symbols(Constants()).can_eliminate:
         fused = FusedSolver(layout, dense_solver(solver), compiled=compiled)
         return FusedEngine(layout, kinematics, task, fused)
-    is_staged = is_quick and compiled and prefers_staged(layout)
-    along = chain_solver(layout, dense_solver(solver)) if is_staged else None
-    if along is not None and ChainEngine.serves(along):
-        return ChainEngine(along, kinematics, task)
+    general: StepSolver
     if layout.own:
-        condensed = CondensedSolver(layout, dense_solver(solver))
-        return GeneralEngine(layout, kinematics, task, condensed, compiled=compiled)
-    return GeneralEngine(layout, kinematics, task, along or make_solver(solver, layout), compiled=compiled)
+        general = CondensedSolver(layout, dense_solver(solver))
+    elif along is not None and prefers_staged(layout):
+        general = along
+    else:
+        general = make_solver(solver, layout)
+    return GeneralEngine(layout, kinematics, task, general, compiled=compiled)
 
 
 def elastic_engine(

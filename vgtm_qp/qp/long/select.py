@@ -9,8 +9,10 @@ from vgtm_qp.qp.long.chain import find_chain
 from vgtm_qp.qp.long.staged import StagedSolver
 from vgtm_qp.qp.long.tracked import TrackedSolver
 
-STAGED_ACTUATORS = 36
-"""Least number of actuators with which elimination along the chain is faster than condensing onto the actuators."""
+STAGED_ACTUATORS, SWEPT_ACTUATORS = 70, 36
+"""Least number of actuators with which elimination along the chain is faster than condensing onto the actuators: by
+NumPy, and in whole steps by C.
+"""
 
 
 def chain_solver(layout: Layout, solver: DenseSolver = DAQP) -> StagedSolver | TrackedSolver | None:
@@ -29,8 +31,13 @@ def chain_solver(layout: Layout, solver: DenseSolver = DAQP) -> StagedSolver | T
 
 
 def prefers_staged(layout: Layout) -> bool:
-    """Whether a `chain_solver` for `layout`, if there is one, is faster than the condensed QP.
+    """Whether a `chain_solver` for `layout`, if there is one, is faster than the condensed QP by NumPy."""
+    return len(layout.arm.actuators) >= STAGED_ACTUATORS and layout.is_tabled
+
+
+def prefers_sweeps(layout: Layout) -> bool:
+    """Whether whole steps by a `chain_solver`, if there is one, are faster than by the condensed QP.
 
     A compiler makes no difference, for the two settle to different states.
     """
-    return len(layout.arm.actuators) >= STAGED_ACTUATORS and layout.is_tabled
+    return len(layout.arm.actuators) >= SWEPT_ACTUATORS and layout.is_tabled
