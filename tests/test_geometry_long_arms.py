@@ -140,6 +140,24 @@ def test_what_a_watch_proves_of_what_bends_holds_all_the_way(seed, rods):
         X = X + way
 
 
+def test_an_obstacle_that_begins_to_move_is_listed_before_it_is_near():
+    X, monitor = long_arm()
+    height = float(X[:, 2].max())
+
+    def ball(velocity):
+        return [sphere("ball", (5.0, 0.0, 0.5 * height), 0.4, velocity)]
+
+    monitor.put(ball((0.0, 0.0, 0.0)))
+    assert not len(monitor.near(X, 0.0, 0.5, self_reach=0.1, tracked=True))
+    monitor.put(ball((-1.0, 0.0, 0.0)))
+    proven = []
+    for time in 0.1 * np.arange(50):
+        proven.append(monitor.along(np.stack([X, X]), time, time + 0.1, 0.08, 0.0, thorough=False).certified)
+        assert not proven[-1] or monitor.least(X, time + 0.1, among="obstacles")[0] >= 0.08 - 1e-9
+    assert proven[0]
+    assert not proven[-1]
+
+
 def check_bounds(candidates, motion, exact):
     """Assert that no bound exceeds the distance it bounds."""
     listed = {is_self: np.zeros(table.shape, dtype=bool) for is_self, table in exact.items()}

@@ -171,7 +171,7 @@ class Watch:
         self._candidates.forget_pieces()
         if self._way is not None:
             self._hold([pairs for pairs in self.groups if pairs.group.is_self])
-            self._way.set(reach=-np.inf, self_reach=-np.inf, far=-np.inf)
+            self._way.set(reach=-np.inf, self_reach=-np.inf, far=-np.inf, fastest=self._scene.pieces.fastest)
 
     def near(
         self,
