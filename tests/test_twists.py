@@ -79,6 +79,27 @@ def bent(setup, rng, size):
     return np.where(moves, home + size * rng.normal(size=home.shape), home)
 
 
+def test_a_row_that_nothing_can_change_has_no_answer(rng):
+    """DAQP leaves out rows of zeros: over nodes of the base, here."""
+    setup = setup_of("sliding", **TRACKED["free tip"])
+    layout, arm = setup.layout, setup.arm
+    fused = FusedEngine(layout, setup.kinematics, setup.task, FusedSolver(layout, compiled=False))
+    plain = GeneralEngine(layout, setup.kinematics, setup.task, make_solver("daqp", layout), compiled=False)
+    assert building().finish() is not None
+    assert fused.is_ready
+    q, nodes = arm.home_configuration, np.flatnonzero(arm.base)[:4][None]
+    here, values = arm.end_effector.position(arm.nodes(q)), q[arm.actuators]
+    straight = Path(np.array([0.0, 1.0]), np.stack([here, here + 1e-3]), np.stack([np.eye(3)] * 2))
+    target = Target(straight, 0.0, 1.0, values - 0.2, values + 0.2, 1.0, 1.0, None)
+    for lower in (-1e-4, 1e-4):
+        rows = ClearanceRows(nodes, rng.normal(size=(1, 4, 3)), np.full(1, lower), str)
+        asked = QPInput(
+            q, q, setup.control_vertices, setup.torsion, target, straight.at(0.0), 0.0, rows, True
+        )
+        both = answers((fused, plain), asked)
+        assert (both is None) == (lower > 0.0)
+
+
 @pytest.mark.parametrize("base", [None, MOVED])
 @pytest.mark.parametrize("tracked", TRACKED)
 @pytest.mark.parametrize("name", ARMS)

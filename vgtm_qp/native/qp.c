@@ -570,6 +570,17 @@ static int ask_daqp(void (*quadprog)(DAQPResult *, DAQPProblem *, DAQPSettings *
     return result.exitflag;
 }
 
+/* Whether a row that nothing can change is out of its bounds: DAQP leaves such rows out. */
+static int contradicts(const Fused *f, int rows)
+{
+    int n = f->unknowns;
+    for (int k = 0; k < rows; k++) {
+        if (f->lower[n + k] <= f->feasibility && f->upper[n + k] >= -f->feasibility) continue;
+        if (norm(f->constraint + (Index)k * n, n) == 0.0) return 1;
+    }
+    return 0;
+}
+
 /* Solve the QP that was assembled with its rows of clearance. */
 static int answer(Fused *f)
 {
@@ -584,7 +595,7 @@ static int answer(Fused *f)
     DAQPProblem problem = {f->unknowns, f->unknowns + rows, f->unknowns, f->hessian, f->gradient,
                            f->constraint, f->upper, f->lower, f->sense};
     f->flag = ask_daqp(f->quadprog, f->defaults, &problem, f->feasibility, f->x, f->multipliers, &f->iterations);
-    if (f->flag == EXIT_INFEASIBLE) return INFEASIBLE;
+    if (f->flag == EXIT_INFEASIBLE || contradicts(f, rows)) return INFEASIBLE;
     residuals(f, rows);
     return DONE;
 }
