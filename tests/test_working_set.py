@@ -44,7 +44,7 @@ def test_it_gives_the_answers_of_daqp_whatever_was_asked_before(name, curve, rng
     assert ours.is_ready
     assert other.is_ready
     bound, answered = 0, 0
-    for seed in rng.integers(2**31, size=30).tolist():
+    for seed in rng.integers(2**31, size=90).tolist():
         draws = np.random.default_rng(seed)
         asked, rows = asked_at_random(layout, seed, base=False, progress=0.0, motion=True)
         # Boxes of all sizes about the present values, some of them points; rows that press and others.
