@@ -192,18 +192,6 @@ static void add_rows(const double *rows, const double *shares, int count, int wi
     for (; j < width; j += 4) add_some(rows + j, shares, count, width, sum + j, 1);
 }
 
-/* The greatest magnitude of numbers; NaN if one is. */
-static double greatest(const double *values, int count)
-{
-    double most[4] = {0.0}, sum = 0.0;
-    int k = 0;
-    for (; k + 4 <= count; k += 4)
-        for (int i = 0; i < 4; i++) most[i] = fabs(values[k + i]) > most[i] ? fabs(values[k + i]) : most[i];
-    for (; k < count; k++) most[0] = fmax(most[0], fabs(values[k]));
-    for (k = 0; k < count; k++) sum += fabs(values[k]);
-    return sum == sum ? fmax(fmax(most[0], most[1]), fmax(most[2], most[3])) : sum;
-}
-
 /* The gradient (C) in the curve's free coordinates of one (V, 3) in the control vertices, added to `free`. */
 static void add_free(const Chain *c, const double *by_vertex, double *free)
 {

@@ -72,13 +72,6 @@ typedef struct {
     int done;                        /* number of pieces that were followed */
 } Way;
 
-static double greatest_of(const double *values, int count)
-{
-    double greatest = 0.0;
-    for (int k = 0; k < count; k++) greatest = values[k] > greatest ? values[k] : greatest;
-    return greatest;
-}
-
 static void displace(Way *w, const double *before, const double *after)
 {
     for (int b = 0; b < w->bodies; b++) {
@@ -97,26 +90,6 @@ static void displace(Way *w, const double *before, const double *after)
     }
 }
 
-/* a + b x c. */
-static void add_cross(const double *a, const double *b, const double *c, double *sum)
-{
-    for (int i = 0; i < 3; i++) {
-        int j = (i + 1) % 3, k = (i + 2) % 3;
-        sum[i] = a[i] + b[j] * c[k] - b[k] * c[j];
-    }
-}
-
-/* The solution of A x = b for a symmetric A (xx, xy, xz, yy, yz, zz), or zero. */
-static void solve_symmetric(const double *A, const double *b, double *x)
-{
-    double xx = A[3] * A[5] - A[4] * A[4], xy = A[2] * A[4] - A[1] * A[5], xz = A[1] * A[4] - A[2] * A[3];
-    double yy = A[0] * A[5] - A[2] * A[2], yz = A[1] * A[2] - A[0] * A[4], zz = A[0] * A[3] - A[1] * A[1];
-    double determinant = A[0] * xx + A[1] * xy + A[2] * xz, inverse = determinant > 0.0 ? 1.0 / determinant : 0.0;
-    x[0] = inverse * (xx * b[0] + xy * b[1] + xz * b[2]);
-    x[1] = inverse * (xy * b[0] + yy * b[1] + yz * b[2]);
-    x[2] = inverse * (xz * b[0] + yz * b[1] + zz * b[2]);
-}
-
 /* Write the centre of part k at a place, and how far its points are from it. */
 static void place_part(const Way *w, int k, const double *place)
 {
@@ -130,47 +103,46 @@ static void place_part(const Way *w, int k, const double *place)
     part->reach = sqrt(square);
 }
 
-/* Write the motion of part k from one place to another: the turn of least squares, about an axis that may be undetermined. */
+/* Write the motion of part k from one place to another, its turn by least squares. */
 static void move_part(const Way *w, int k, const double *before, const double *after)
 {
     Rigid *part = w->part + k;
     const int *first = w->part_points + w->points_at[k], *last = w->part_points + w->points_at[k + 1];
-    double inertia[6] = {0.0}, moment[3] = {0.0}, square = 0.0;
+    double inertia[9] = {0.0}, moment[3] = {0.0}, r[3], moved[3], part_of[3], square = 0.0, trace = 0.0;
     place_part(w, k, before);
     memset(part->shift, 0, sizeof(part->shift));
     for (const int *p = first; p < last; p++)
         for (int a = 0; a < 3; a++) part->shift[a] += (after[3 * *p + a] - before[3 * *p + a]) / (double)(last - first);
     for (const int *p = first; p < last; p++) {
-        double r[3], moved[3];
         for (int a = 0; a < 3; a++) {
             r[a] = before[3 * *p + a] - part->centre[a];
             moved[a] = after[3 * *p + a] - before[3 * *p + a];
         }
-        add_cross(moment, r, moved, moment);
-        inertia[0] += r[1] * r[1] + r[2] * r[2];
-        inertia[1] -= r[0] * r[1];
-        inertia[2] -= r[0] * r[2];
-        inertia[3] += r[0] * r[0] + r[2] * r[2];
-        inertia[4] -= r[1] * r[2];
-        inertia[5] += r[0] * r[0] + r[1] * r[1];
+        cross(r, moved, part_of);
+        for (int a = 0; a < 3; a++) {
+            moment[a] += part_of[a];
+            inertia[4 * a] += dot(r, r, 3);
+            for (int b = 0; b < 3; b++) inertia[3 * a + b] -= r[a] * r[b];
+        }
     }
-    double more = 1e-9 * (inertia[0] + inertia[3] + inertia[5]);
-    for (int i = 0; i < 3; i++) inertia[i == 0 ? 0 : i == 1 ? 3 : 5] += more;
-    solve_symmetric(inertia, moment, part->turn);
+    for (int a = 0; a < 3; a++) trace += inertia[4 * a];
+    for (int a = 0; a < 3; a++) inertia[4 * a] += 1e-9 * trace;
+    memcpy(part->turn, moment, sizeof(moment));
+    /* Points that coincide have no turn. */
+    if (trace > 0.0) solve_for(inertia, part->turn, 3, 1);
     for (const int *p = first; p < last; p++) {
-        double r[3], by[3], moved[3];
         for (int a = 0; a < 3; a++) {
             r[a] = before[3 * *p + a] - part->centre[a];
-            moved[a] = after[3 * *p + a] - before[3 * *p + a];
+            moved[a] = after[3 * *p + a] - before[3 * *p + a] - part->shift[a];
         }
-        add_cross(part->shift, part->turn, r, by);
-        square = fmax(square, square_of(by, moved));
+        cross(part->turn, r, part_of);
+        square = fmax(square, square_of(part_of, moved));
     }
     part->off = sqrt(square);
 }
 
-/* How much nearer two bodies of near parts come at most on the straight way from one place to another. With any w, two
-   points r apart that move by w x r + d against each other come no nearer than |d|: w x r leads away. */
+/* By how much two bodies of near parts come nearer at most on the straight way from one place to another. For any w, two
+   points r apart that move by w x r + d against each other come nearer by |d| at most: |r + s w x r| is never below |r|. */
 static double bending(const Way *w, const double *before, const double *after)
 {
     double most = 0.0;
@@ -184,11 +156,17 @@ static double bending(const Way *w, const double *before, const double *after)
                 turn[a] = 0.5 * (p->turn[a] + q->turn[a]);
                 shift[a] = q->shift[a] - p->shift[a];
             }
-            add_cross((const double[3]){0.0, 0.0, 0.0}, turn, apart, by);
+            cross(turn, apart, by);
             change += sqrt(square_of(by, shift)) + 0.5 * sqrt(square_of(p->turn, q->turn)) * (p->reach + q->reach);
             most = fmax(change, most);
         }
     return most;
+}
+
+/* A lower bound of the distances of bodies whose pairs no group has. */
+static double self_far_of(const Way *w)
+{
+    return least_of(w->self_far, w->parted);
 }
 
 /* Find how far bodies of parts that are not near to each other are apart at the present place. */
@@ -341,12 +319,11 @@ EXPORT int follow(Way *w)
         w->since = w->until;
         w->until = is_last ? w->end : w->start + (double)w->done / w->pieces * (w->end - w->start);
         displace(w, before, after);
-        double greatest = greatest_of(w->moved, w->bodies);
-        w->far -= greatest + w->fastest * fabs(w->until - w->since);
-        w->parted -= 2.0 * greatest;
+        double furthest = greatest(w->moved, w->bodies);
+        w->far -= furthest + w->fastest * fabs(w->until - w->since);
+        w->parted -= 2.0 * furthest;
         if (w->parts) w->self_far -= bending(w, before, after);
-        double self_far = least_of(w->self_far, w->parted);
-        if (!(w->far >= w->floor && self_far >= w->self_floor)) is_proven = 0;
+        if (!(w->far >= w->floor && self_far_of(w) >= w->self_floor)) is_proven = 0;
         for (int g = 0; g < w->groups; g++) {
             Pairs *pairs = w->group[g];
             /* Before the last place only the floor matters. */
@@ -363,7 +340,7 @@ EXPORT int follow(Way *w)
     memcpy(w->place, w->places + w->done * step, sizeof(double) * step);
     w->time = w->until;
     w->reach = fmin(w->done == w->pieces ? w->limit : w->floor, w->far);
-    w->self_reach = fmin(w->done == w->pieces ? w->self_limit : w->self_floor, least_of(w->self_far, w->parted));
+    w->self_reach = fmin(w->done == w->pieces ? w->self_limit : w->self_floor, self_far_of(w));
     return is_proven ? DONE : NOT_PROVEN;
 }
 

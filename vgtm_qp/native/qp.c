@@ -105,43 +105,6 @@ static const double WILL = 1e-12, GOOD = 1e-11;
    the moments of these (3). */
 enum { SUMS = 16 };
 
-static void cross(const double *a, const double *b, double *c)
-{
-    c[0] = a[1] * b[2] - a[2] * b[1];
-    c[1] = a[2] * b[0] - a[0] * b[2];
-    c[2] = a[0] * b[1] - a[1] * b[0];
-}
-
-/* In place, rows X (m, w) become A^-1 X; A (m, m) is overwritten. Rows are chosen by their largest entry. */
-static void solve_for(double *A, double *X, int m, int w)
-{
-    for (int j = 0; j < m; j++) {
-        int best = j;
-        for (int i = j + 1; i < m; i++)
-            if (fabs(A[i * m + j]) > fabs(A[best * m + j])) best = i;
-        if (best != j) {
-            for (int k = j; k < m; k++) { double t = A[j * m + k]; A[j * m + k] = A[best * m + k]; A[best * m + k] = t; }
-            for (int k = 0; k < w; k++) { double t = X[j * w + k]; X[j * w + k] = X[best * w + k]; X[best * w + k] = t; }
-        }
-        double pivot = 1.0 / A[j * m + j];
-        for (int i = j + 1; i < m; i++) {
-            double factor = A[i * m + j] * pivot;
-            if (factor == 0.0) continue;
-            for (int k = j + 1; k < m; k++) A[i * m + k] -= factor * A[j * m + k];
-            for (int k = 0; k < w; k++) X[i * w + k] -= factor * X[j * w + k];
-        }
-    }
-    for (int j = m - 1; j >= 0; j--) {
-        double pivot = 1.0 / A[j * m + j];
-        for (int k = 0; k < w; k++) X[j * w + k] *= pivot;
-        for (int i = 0; i < j; i++) {
-            double factor = A[i * m + j];
-            if (factor == 0.0) continue;
-            for (int k = 0; k < w; k++) X[i * w + k] -= factor * X[j * w + k];
-        }
-    }
-}
-
 /* How the free nodes move: r, then K, stage after stage. The blocks of a stage are D (m, m) over its own coordinates, and
    the right-hand sides (m, 1 + n_a): its actuators' changes less what earlier coordinates contribute. */
 static void respond(Fused *f)

@@ -2,8 +2,8 @@
 
    It is for arms whose bodies are capsules, among pairs that a Way holds. The caller fills in goal and
    boxes among the arguments of the QP's function. A long arm's QP is a Chain's; then the Fused has the input, in the
-   order of StepGraph.inputs, and names the places of the answer, but has no functions. Anything unusual ends the step with a code and leaves the state as it
-   was; the caller then asks for a further QP, or takes the step by other means. */
+   order of StepGraph.inputs, and names the places of the answer, but has no functions. Anything unusual ends the step with
+   a code and leaves the state as it was; the caller then asks for a further QP, or takes the step by other means. */
 
 #include <time.h>
 
@@ -477,7 +477,7 @@ static double greatest_gap(const StepData *s)
 /* Whether every pair keeps its clearance at the present place of the way. */
 static int is_clear(const StepData *s)
 {
-    if (!(s->way->far >= s->safe - s->rounding && fmin(s->way->self_far, s->way->parted) >= s->self_safe - s->rounding)) return 0;
+    if (!(s->way->far >= s->safe - s->rounding && self_far_of(s->way) >= s->self_safe - s->rounding)) return 0;
     for (int g = 0; g < s->way->groups; g++) {
         const Pairs *p = s->way->group[g];
         double floor = (p->is_self ? s->self_safe : s->safe) - s->rounding;
