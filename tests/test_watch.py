@@ -187,7 +187,7 @@ def compare(first, second, X, **reach):
     """Compare the contacts that two monitors find; return how many they are."""
     found = [monitor.near(X, **reach, tracked=True) for monitor in (first, second)]
     orders = [np.lexsort((c.weights[:, 1], c.other, c.body, c.is_self)) for c in found]
-    names = [[c.name(k) for k in order.tolist()] for c, order in zip(found, orders, strict=True)]
+    names = [[c.name(k) for k in range(len(c))] for c in found]
     assert names[0] == names[1]
     for column in ("distance", "normal", "points", "weights", "normal_speed", "by_fcl"):
         first, second = (getattr(c, column)[order] for c, order in zip(found, orders, strict=True))
@@ -281,22 +281,24 @@ def test_a_pair_without_a_bound_is_never_proven_by_the_pairs_beside_it(broken):
     ends, known = ca.SX.sym("ends", 24), ca.SX.sym("known", 19)
     contact = Kernel(ca.Function("contact", [ends, known], [ca.repmat(known[0], 19)]), compiled=False)
     pairs, way = Program("Pairs"), Program("Way")
-    given = np.zeros((3, 19))
+    given = np.zeros((3, 15))
     given[:, 0] = 0.05
     given[broken, 0] = np.nan
-    numbers = {"body": np.arange(3), "other": np.zeros(3), "points": np.zeros((3, 4))}
-    pairs.set(**{name: array.astype(np.int32) for name, array in numbers.items()})
-    pairs.set(count=3, is_self=0, lower=np.full(3, 0.05), known=given, next=2.0, contact=contact)
+    listed = np.array(
+        [(k, k, 0.05) for k in range(3)], dtype=[("body", "i4"), ("other", "i4"), ("lower", "f8")]
+    )
+    pairs.set(count=3, is_self=0, listed=listed, normal=np.zeros((3, 3)))
+    pairs.set(next=2.0, contact=contact, rows=np.zeros(3, dtype=np.int64), contacts=np.zeros((6, 9)))
     pairs.set(ends=contact.inputs[0], pair=contact.inputs[1], found=contact.outputs[0])
-    pairs.set(rows=np.zeros(3, dtype=np.int64), contacts=np.zeros((6, 9)))
     way.set(pieces=1, points=2, bodies=3, groups=1, furthest=1e60, places=np.zeros((2, 2, 3)))
     way.set(
         ends=np.tile(np.array([0, 1], dtype=np.int32), 3), group=np.array([pairs.address], dtype=np.uintp)
     )
-    way.set(floor=0.0, limit=0.1, middle=np.zeros((3, 3)), turned=np.zeros(3), moved=np.zeros(3))
+    way.set(solid=given, speed=np.zeros(3), allowance=np.zeros(3), radius=np.zeros(3))
+    way.set(wanted=0.1, middle=np.zeros((3, 3)), turned=np.zeros(3), moved=np.zeros(3))
     way.set(place=np.zeros((2, 3)))
     for code in (Code.DONE, Code.NOT_PROVEN):
-        assert way.call("follow") is code
+        assert way.call("prove_path") is code
         assert pairs.data.near == 3
         assert pairs.data.overlaps
     assert not pairs.data.lowest >= 0.0

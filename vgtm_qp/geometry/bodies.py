@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.sparse import csr_array
 
 from vgtm_qp.arrays import Array, Index, Mask
 
@@ -174,6 +175,16 @@ class Bodies:
             pairs = np.minimum(first, second) * count + np.maximum(first, second)
             allowed |= np.isin(pairs, self.touching.min(axis=1) * count + self.touching.max(axis=1))
         return np.asarray(allowed)
+
+    @cached_property
+    def neighbours(self) -> tuple[Index, Index]:
+        """All bodies that each one may touch, itself among them, body after body, and (B + 1,) where these begin."""
+        ends = np.unique(self.joints, return_inverse=True)[1].reshape(-1)
+        every, (first, second) = np.arange(len(self)), self.touching.reshape(-1, 2).T
+        at = csr_array((np.ones(len(ends)), (np.repeat(every, 2), ends)))
+        pairs = csr_array((np.ones(len(first)), (first, second)), shape=(len(self), len(self)))
+        found = csr_array(at @ at.T + pairs + pairs.T)
+        return np.asarray(found.indices), np.asarray(found.indptr)
 
     def called(self, body: int) -> str:
         """Return kind and name of a body: ``"member L3-2"``, ``"carried crate"``."""

@@ -16,7 +16,7 @@ from vgtm_qp.geometry.shapes import GeometryError
 Motion = tuple[Displacement, Displacement, Displacement]
 """Displacements from the references of the three lists."""
 
-TO_PIECES, _RIGID, _BENDING = range(3)
+_TO_PIECES, _RIGID, _BENDING = range(3)
 
 _FEW_PAIRS = 40_000
 """Greatest number of bodies, times that of bodies and pieces, of a scene that lists all pairs."""
@@ -29,12 +29,11 @@ class _PairList:
     """Pairs that share a reference: the positions (P, 3), m, and the time, s, at which they were compared.
 
     Pairs of the same kind that are not listed were at least the horizon, m, apart at the reference.
-    `unneeded` counts the pairs that have been evaluated since and were far, `renewals` how often the list changed.
+    `unneeded` counts the pairs that have been evaluated since and were far.
     """
 
     def __init__(self, reference: Array, time: float) -> None:
         self.groups: list[Group] = []
-        self.renewals = 0
         self.renew([], reference, time, np.inf)
 
     def renew(self, groups: list[Group], X: Array, time: float, horizon: float) -> None:
@@ -42,7 +41,6 @@ class _PairList:
         for group in groups:
             group.keep_near(X, time, horizon)
         self.reference, self.time, self.horizon, self.unneeded = X, time, horizon, 0
-        self.renewals += 1
         self.groups = [group for group in groups if len(group)]
 
     def __len__(self) -> int:
@@ -67,20 +65,10 @@ class Candidates:
         """The pairs of each shape; no group is empty."""
         return [group for pairs in self._lists for group in pairs.groups]
 
-    @property
-    def renewals(self) -> list[int]:
-        """How often each list changed; ``Group.place`` is the index of a group's list."""
-        return [pairs.renewals for pairs in self._lists]
-
-    @property
-    def parts(self) -> Parts | None:
-        """The parts of the arm; None where pairs of bodies do not count."""
-        return self._parts if self._lists and self._scene.has_self else None
-
     def forget_pieces(self) -> None:
         """Forget the pairs with pieces, because the pieces are others now; pairs of bodies are kept."""
         if self._lists:
-            pairs = self._lists[TO_PIECES]
+            pairs = self._lists[_TO_PIECES]
             pairs.renew([], pairs.reference, pairs.time, -np.inf)
 
     def cover(
@@ -132,7 +120,7 @@ class Candidates:
     def _renew_pieces(self, X: Array, time: float, horizon: float) -> None:
         """List the pairs of a body and a piece that are nearer than `horizon`, m, at `X`, the new reference."""
         groups = _groups_with_pieces(X, self._scene, time, horizon)
-        self._lists[TO_PIECES].renew(groups, X, time, horizon if len(self._scene.pieces) else np.inf)
+        self._lists[_TO_PIECES].renew(groups, X, time, horizon if len(self._scene.pieces) else np.inf)
 
     def renew_bodies(self, X: Array, time: float, horizon: float) -> None:
         """List the pairs of two bodies that are nearer than `horizon`, m, at `X`, the new reference."""
@@ -172,7 +160,6 @@ class Candidates:
             for group in rigid.groups:
                 group.select(~parts.among(now_bending, group.body, group.other))
             rigid.groups = [group for group in rigid.groups if len(group)]
-            rigid.renewals += 1
         elif bending.horizon - 2.0 * (self._bending_displacement(X) + travel) >= reach:
             return
         bodies, self._bending_points = parts.inside(np.unique(parts.near[is_bending]))
@@ -239,19 +226,15 @@ class Candidates:
 
     def beyond(self, motion: Motion) -> tuple[float, float]:
         """Return lower bounds, m, of the distances of the pairs not listed: to pieces, and between bodies."""
-        far = self._lists[TO_PIECES].horizon - motion[TO_PIECES].greatest
+        to_pieces, rigid, bending = self._lists
+        far = to_pieces.horizon - motion[_TO_PIECES].greatest
         if not self._scene.has_self:
             return far, np.inf
-        return far, min(self.apart(motion))
-
-    def apart(self, motion: Motion) -> tuple[float, float]:
-        """Return lower bounds, m, of the distances of bodies that are not listed: in near parts, and in others."""
-        _, rigid, bending = self._lists
         # Pairs in near parts came nearer by no more than these bent; all other pairs are bounded by their
         # parts.
         since = motion[_RIGID].greatest - self._bent
         near = min(rigid.horizon - self._bent - since, bending.horizon - motion[_BENDING].greatest)
-        return near, self._parts.beyond - since
+        return far, min(near, self._parts.beyond - since)
 
 
 def _groups_with_pieces(X: Array, scene: Scene, time: float, horizon: float) -> list[Group]:

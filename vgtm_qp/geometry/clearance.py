@@ -166,10 +166,10 @@ class Clearance:
             # A negated comparison is true for NaN.
             rows = np.flatnonzero(~(group.lower(motion, limit)[0] >= limit))
             if len(rows):
+                # Of rows that depend on one another a solver takes the first ones.
+                rows = rows[np.lexsort((group.other[rows], group.body[rows]))]
                 both = group.evaluate(group.at(X, time, rows))
-                distance = both[:, :, 0].T
-                # All first contacts, then all second ones.
-                which, k = np.nonzero(~(distance >= min(limit, FAR)))
+                k, which = np.nonzero(~(both[:, :, 0] >= min(limit, FAR)))
                 found, pairs = both[k, which], rows[k]
                 candidates.count_unneeded(group, len(rows) - int(np.count_nonzero(which == 0)))
                 if wanted is not None:

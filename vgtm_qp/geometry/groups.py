@@ -83,7 +83,7 @@ class Scene:
         self.fcl, self.of_hulls = queries if self._by_fcl else None, queries
         self.nothing_found = np.zeros((0, 2 * self.span + 5))
         self.nothing = self._contacts(np.zeros((0, 2 * self.span + 4), dtype=np.int64), self.nothing_found)
-        self.shapes = sorted({*self.pieces.shape.tolist()} | ({"segment"} if self.has_self else set()))
+        self.shapes = [*np.unique(self.pieces.shape).tolist(), *(["segment"] if self.has_self else [])]
         for make in (distance_function, sweep_function, *((proof_function,) if self.fcl else ())):
             for shape in self.shapes:
                 self.batch(make, shape)

@@ -18,63 +18,82 @@ BODIES = 32
 """Greatest number of bodies of a part: about three bays of a truss."""
 
 
+class Division:
+    """Bodies, divided by their positions at `X` (P, 3).
+
+    Attributes
+    ----------
+    bodies, bodies_at : (B,) int, (parts + 1,) int
+        The bodies of each part, part after part, and where these begin.
+    points, points_at : 1-D int, (parts + 1,) int
+        The points of each part, and where these begin.
+    thickness : (parts,)
+        Greatest radius of a body of each, m.
+    of, part : (B,) int, 1-D int
+        The part of each body, and of each of the `points`.
+    """
+
+    def __init__(self, bodies: Bodies, X: Array) -> None:
+        tree = cKDTree(X[bodies.points].mean(axis=1), leafsize=BODIES)
+        self.bodies, self.bodies_at = tree.indices, np.array([*_leaves(tree.tree), len(bodies)])
+        self.of = np.empty(len(bodies), dtype=np.int64)
+        self.of[self.bodies] = np.repeat(np.arange(len(self)), np.diff(self.bodies_at))
+        self.thickness = np.maximum.reduceat(bodies.radius[self.bodies], self.bodies_at[:-1])
+        # A point is in each part that has one of its bodies, once.
+        span = bodies.points.shape[1]
+        points = np.unique(np.repeat(self.of, span) * len(X) + bodies.points.reshape(-1))
+        self.part, self.points = np.divmod(points, len(X))
+        self.points_at = np.searchsorted(self.part, np.arange(len(self) + 1))
+
+    def __len__(self) -> int:
+        return len(self.bodies_at) - 1
+
+
 class Parts:
-    """Bodies, divided by position at `X` (P, 3); parts whose balls are nearer than a horizon, m, are near.
+    """The :class:`Division` of bodies at `X` (P, 3); parts whose balls are nearer than a horizon, m, are near.
 
     Attributes
     ----------
     near : (K, 2) int
         Pairs of parts that are near, among them each part with itself.
-    points, starts : 1-D int, (parts,) int
-        The points of each part, part after part, and where these begin.
-    thickness : (parts,)
-        Greatest radius of a body of each, m.
     beyond : float
         Lower bound of the distances of parts that are not near, at the positions of :meth:`update_beyond`, m.
     """
 
     def __init__(self, bodies: Bodies, X: Array, horizon: float) -> None:
-        tree = cKDTree(X[bodies.points].mean(axis=1), leafsize=BODIES)
-        first = _leaves(tree.tree)
-        self._of = np.empty(len(bodies), dtype=np.int64)
-        self._of[tree.indices] = np.searchsorted(first, np.arange(len(bodies)), side="right") - 1
-        every = np.arange(len(first))
-        self.thickness = np.zeros(len(every))
-        np.maximum.at(self.thickness, self._of, bodies.radius)
-        # A point is in each part that has one of its bodies, once.
-        span = bodies.points.shape[1]
-        points = np.unique(np.repeat(self._of, span) * len(X) + bodies.points.reshape(-1))
-        self._part, self.points = np.divmod(points, len(X))
-        self.starts = np.searchsorted(self._part, every)
+        self._are = Division(bodies, X)
         self._horizon = self.beyond = horizon
         pairs, gaps = self._pairs(X)
+        every = np.arange(len(self._are))
         self.near = np.concatenate([np.stack([every, every], axis=1), pairs[gaps < horizon]])
         self._codes = self._codes_of(*self.near.T)
 
     def among(self, chosen: Mask, first: Index, second: Index) -> Mask:
         """Return (K,) which pairs of bodies are in the pairs of parts that `chosen` picks from `near`."""
-        return np.isin(self._codes_of(self._of[first], self._of[second]), self._codes[chosen])
+        return np.isin(self._codes_of(self._are.of[first], self._are.of[second]), self._codes[chosen])
 
     def _codes_of(self, first: Index, second: Index) -> Index:
         """Return (K,) a number for each pair of parts, the same in either order."""
-        return np.asarray(np.minimum(first, second) * len(self.starts) + np.maximum(first, second))
+        return np.asarray(np.minimum(first, second) * len(self._are) + np.maximum(first, second))
 
     def inside(self, parts: Index) -> tuple[Index, Index]:
         """Return the bodies of some parts, and the points that span these."""
-        return np.flatnonzero(np.isin(self._of, parts)), np.unique(self.points[np.isin(self._part, parts)])
+        are = self._are
+        return np.flatnonzero(np.isin(are.of, parts)), np.unique(are.points[np.isin(are.part, parts)])
 
     def _balls(self, vectors: Array) -> tuple[Array, Array]:
         """Return centers (K, 3) and radii (K,) of balls round the vectors (P, 3) of the points of each part."""
-        own = vectors.take(self.points, axis=0)
-        center = np.add.reduceat(own, self.starts, axis=0) / np.bincount(self._part)[:, None]
-        own -= center.take(self._part, axis=0)
-        square = np.maximum.reduceat(np.einsum("kc,kc->k", own, own), self.starts)
+        are = self._are
+        own, starts = vectors.take(are.points, axis=0), are.points_at[:-1]
+        center = np.add.reduceat(own, starts, axis=0) / np.diff(are.points_at)[:, None]
+        own -= center.take(are.part, axis=0)
+        square = np.maximum.reduceat(np.einsum("kc,kc->k", own, own), starts)
         return center, np.sqrt(square)
 
     def _pairs(self, X: Array) -> tuple[Index, Array]:
         """Return pairs of parts (K, 2), among them all nearer than the horizon at `X`, and their distances (K,), m."""
         center, radius = self._balls(X)
-        radius += self.thickness
+        radius += self._are.thickness
         reach = 2.0 * float(radius.max()) + self._horizon
         pairs = cKDTree(center).query_pairs(reach, output_type="ndarray").astype(np.int64)
         first, second = pairs.T

@@ -45,7 +45,7 @@ class Code(IntEnum):
         FAILED,
         TOO_FAR,
         NOT_PROVEN,
-        ELSEWHERE,
+        FULL,
         CROWDED,
         OVERLAPPING,
         ASKS,

@@ -1,6 +1,7 @@
 /* The beginning of our C: what follows it in one text are pairs.c, qp.c, chain.c and step.c. */
 
 #include <math.h>
+#include <stdlib.h>
 #include <string.h>
 
 #define EXPORT __attribute__((visibility("default")))
@@ -9,7 +10,7 @@ typedef long long Index;
 
 /* What functions return; see Code in __init__.py. */
 enum {
-    DONE, NO_VALUE, INFEASIBLE, INACCURATE, UNSETTLED, FAILED, TOO_FAR, NOT_PROVEN, ELSEWHERE, CROWDED, OVERLAPPING,
+    DONE, NO_VALUE, INFEASIBLE, INACCURATE, UNSETTLED, FAILED, TOO_FAR, NOT_PROVEN, FULL, CROWDED, OVERLAPPING,
     ASKS, FLAWED, OFF_CURVE, TOO_NEAR
 };
 

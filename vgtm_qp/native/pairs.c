@@ -1,8 +1,15 @@
-/* Pairs of bodies and pieces over straight motions: which may have come near, and the contacts of these. */
+/* Pairs of bodies and of convex pieces of obstacles over straight motions: which may have come near, and the contacts of
+   these. */
 
-/* Lengths of the arrays of follow_function: ends of a pair before and after a motion; known, whose last three
-   numbers are a normal; the two contacts, whose normals are numbers 5 to 7 of each, from 0. */
-enum { ENDS = 24, KNOWN = 19, KNOWN_NORMAL = 16, CONTACTS = 18, CONTACT = 9, NORMAL = 5 };
+/* Lengths of the arrays of follow_function: ends of a pair before and after a motion; known, which are a piece, a radius
+   and a normal; the two contacts, whose normals are numbers 5 to 7 of each, from 0. */
+enum { ENDS = 24, KNOWN = 19, SOLID = 15, KNOWN_NORMAL = 16, CONTACTS = 18, CONTACT = 9, NORMAL = 5 };
+
+/* Numbers of the axis of a body at a place: its middle, half of it, and the radius of a ball round the body. */
+enum { AXIS = 7 };
+
+/* Least bound of the distances of pairs that are not listed, over the distance below which pairs are evaluated. */
+static const double AMPLE = 1.3;
 
 /* The lesser of two numbers; NaN if either is NaN. */
 static double least_of(double a, double b)
@@ -17,12 +24,14 @@ static double square_of(const double *before, const double *after)
     return square;
 }
 
-/* Pairs of one shape, each with a lower bound of its distance. */
+/* A body, and a piece or another body, with a lower bound of their distance. */
+typedef struct { int body, other; double lower; } Listed;
+
+/* The listed pairs of one shape. */
 typedef struct {
-    int count, is_self;
-    const int *body, *other, *points;    /* (C), (C), (C, 4) */
-    double *lower, *known;               /* (C), (C, 19): see follow_function; of a piece as it is at time 0 */
-    const double *velocity, *speed;      /* (C, 3), (C) of the pieces, m/s; null where none moves */
+    int count, room, is_self;
+    Listed *listed;                      /* (room) */
+    double *normal;                      /* (room, 3): unit, of the last evaluation */
     double next;                         /* if no pair is near, pairs below next * limit are evaluated too */
 
     Kernel contact;                      /* (ends 24, known 19) -> 18 numbers of contacts, and a bound */
@@ -35,8 +44,8 @@ typedef struct {
 
     int near, is_close, overlaps;
     double lowest;                       /* least lower bound over the motion of the evaluated pairs */
-    Index *rows;                         /* (C): the evaluated pairs */
-    double *contacts;                    /* (2 C, 9): two for each */
+    Index *rows;                         /* (room): the evaluated pairs */
+    double *contacts;                    /* (2 room, 9): two for each */
 } Pairs;
 
 /* The motion of a part of an arm: displacement of its centre, turn, and how far points leave that motion; the centre, and
@@ -45,32 +54,61 @@ typedef struct { double centre[3], shift[3], turn[3], off, reach; } Rigid;
 
 /* The path of an arm in straight pieces, each from one place of all its points to the next. */
 typedef struct {
-    int pieces, points, bodies, groups;
-    const int *ends;                 /* (B, 2) points */
+    int pieces, points;
     const double *places;            /* (K + 1, P, 3) */
     double start, end;               /* times at both ends, s */
     double furthest;                 /* bound of the sum of the squares of displacements */
-    Pairs **group;                   /* (G) */
     /* Distances to prove from pieces and between bodies, and those below which pairs are evaluated at the end. */
     double floor, self_floor, limit, self_limit;
 
     double *place, time;             /* (P, 3), s: the present ones, where pairs nearer than the reach are evaluated */
     double reach, self_reach, wanted, self_wanted;    /* wanted: the reach of the next place */
-    /* Lower bounds of the distances of pairs that no group has: from pieces, the fastest of which has that speed, m/s;
-       between bodies in parts of the arm that are near to each other, and in others. The points of each part, and where
-       they begin; the greatest radius of its bodies; the later parts that it is near to, itself the first of them. */
-    double far, self_far, parted, fastest;
-    int parts;
-    const int *part_points, *points_at, *neighbour, *neighbours_at;
-    const double *thickness;
-    Rigid *part;                           /* (parts) */
+    double *line;                    /* (2, P, 3) */
     int lost;                        /* whether a pair had no value, so that nothing is known of any */
+
+    int bodies;
+    const int *ends, *touching, *touching_at;    /* (B, 2) points; the bodies that each may touch, and where they begin */
+    const double *radius;            /* (B) */
+    double *axis;                    /* (B, 7) */
+    /* Convex pieces of obstacles: parameters at time 0 (15), centre then and radius of the ball round it, allowance,
+       velocity and speed, m/s, the greatest of these, and the number of its group. */
+    int solids;
+    const double *solid, *centre, *extent, *allowance, *velocity, *speed;
+    double fastest;
+    const int *kind;
+
+    int groups;
+    Pairs **group, *among;           /* (G); those of two bodies, or null where these do not count */
+    /* Pairs that become near in a step, and how much further away others are that are listed with them. */
+    double influence, self_influence, slack, most;
+    /* Lower bounds of the distances of pairs that are not listed: from pieces; between bodies in parts of the arm that
+       are near to each other, and in others. */
+    double far, self_far, parted;
+    /* The parts: their points and bodies, and where they begin; the greatest radius of their bodies; the later parts that
+       each is near to, itself the first of them. */
+    int parts, neighbour_room;
+    const int *part_points, *points_at, *part_bodies, *bodies_at;
+    const double *thickness;
+    int *neighbour, *neighbours_at;
+    Rigid *part;                           /* (parts) */
 
     double *middle, *turned, *moved; /* (B, 3), (B), (B): of each axis in the present piece the displacement
                                         of its middle, half that between its ends, the greater of its ends' */
     double since, until;             /* times at both ends of that piece */
     int done;                        /* number of pieces that were followed */
 } Way;
+
+/* Which points are the ends of pair k: two of the body, then two of the other body, or the same again for a piece. */
+static int point_of(const Way *w, const Pairs *p, int k, int end)
+{
+    return w->ends[2 * (end < 2 || !p->is_self ? p->listed[k].body : p->listed[k].other) + end % 2];
+}
+
+/* The radius of the body of pair k less the allowance of the piece, or the sum of both radii. */
+static double thickness_of(const Way *w, const Pairs *p, int k)
+{
+    return w->radius[p->listed[k].body] + (p->is_self ? w->radius[p->listed[k].other] : -w->allowance[p->listed[k].other]);
+}
 
 static void displace(Way *w, const double *before, const double *after)
 {
@@ -169,14 +207,19 @@ static double self_far_of(const Way *w)
     return least_of(w->self_far, w->parted);
 }
 
-/* Find how far bodies of parts that are not near to each other are apart at the present place. */
-EXPORT int measure_parts(Way *w)
+/* Write where the parts are at the present place, and how far their bodies reach from there. */
+static void place_parts(Way *w)
 {
-    double least = INFINITY;
     for (int k = 0; k < w->parts; k++) {
         place_part(w, k, w->place);
         w->part[k].reach += w->thickness[k];
     }
+}
+
+/* Find how far bodies of parts that are not near to each other are apart, where the parts were placed. */
+static void measure_parts(Way *w)
+{
+    double least = INFINITY;
     for (int k = 0; k < w->parts; k++) {
         const int *near = w->neighbour + w->neighbours_at[k], *last = w->neighbour + w->neighbours_at[k + 1];
         for (int q = k; q < w->parts; q++) {
@@ -190,37 +233,174 @@ EXPORT int measure_parts(Way *w)
         }
     }
     w->parted = least;
+}
+
+/* List a pair that may be nearer than the horizon: of a body, and of another one or a piece with these axes, which are
+   further apart than the sum of their radii, `thick`, and a bound along the line between their middles. */
+static int list_if_near(const Way *w, Pairs *p, int body, int other, const double *second, double thick, double horizon)
+{
+    const double *first = w->axis + AXIS * body;
+    double between[3], room = horizon + first[6] + second[6], square = square_of(first, second), lower = -INFINITY;
+    if (square >= room * room) return DONE;
+    for (int a = 0; a < 3; a++) between[a] = second[a] - first[a];
+    double apart = sqrt(square);
+    if (apart > 0.0) lower = apart - (fabs(dot(between, first + 3, 3)) + fabs(dot(between, second + 3, 3))) / apart - thick;
+    if (lower >= horizon) return DONE;
+    if (p->is_self)
+        for (int i = w->touching_at[body]; i < w->touching_at[body + 1]; i++)
+            if (w->touching[i] == other) return DONE;
+    if (p->count == p->room) return FULL;
+    int k = p->count++;
+    p->listed[k] = (Listed){body, other, lower};
+    p->normal[3 * k] = p->normal[3 * k + 1] = 0.0;
+    p->normal[3 * k + 2] = 1.0;
     return DONE;
+}
+
+/* Forget the pairs of a group. */
+static void clear(Pairs *p)
+{
+    p->count = p->near = p->is_close = p->overlaps = 0;
+}
+
+/* Pairs by body and then by other. */
+static int compare(const void *first, const void *second)
+{
+    const Listed *p = first, *q = second;
+    return p->body != q->body ? p->body - q->body : p->other - q->other;
+}
+
+/* Sort the pairs of bodies, or those with pieces: of rows that depend on one another a solver takes the first ones. */
+static void sort_pairs(Way *w, int is_self)
+{
+    for (int g = 0; g < w->groups; g++)
+        if (w->group[g]->is_self == is_self) qsort(w->group[g]->listed, w->group[g]->count, sizeof(Listed), compare);
+}
+
+/* List the pairs of a body and a piece that may be nearer than the horizon at the present place. */
+static int list_solids(Way *w, double horizon)
+{
+    for (int g = 0; g < w->groups; g++)
+        if (!w->group[g]->is_self) clear(w->group[g]);
+    w->far = -INFINITY;
+    for (int o = 0; o < w->solids; o++) {
+        double ball[AXIS] = {0.0};
+        for (int a = 0; a < 3; a++) ball[a] = w->centre[3 * o + a] + w->time * w->velocity[3 * o + a];
+        ball[6] = w->extent[o];
+        for (int b = 0; b < w->bodies; b++)
+            if (list_if_near(w, w->group[w->kind[o]], b, o, ball, w->radius[b] + w->extent[o], horizon)) return FULL;
+    }
+    sort_pairs(w, 0);
+    w->far = w->solids ? horizon : INFINITY;
+    return DONE;
+}
+
+/* List the pairs of two bodies that may be nearer than the horizon at the present place, and see which parts are near:
+   within twice the horizon, so that parts may come nearer before their bodies must be listed. */
+static int list_bodies(Way *w, double horizon)
+{
+    Pairs *p = w->among;
+    int count = 0;
+    clear(p);
+    w->self_far = -INFINITY;
+    place_parts(w);
+    for (int k = 0; k < w->parts; k++) {
+        w->neighbours_at[k] = count;
+        for (int q = k; q < w->parts; q++) {
+            double reach = w->part[k].reach + w->part[q].reach, room = 2.0 * horizon + reach;
+            double square = square_of(w->part[k].centre, w->part[q].centre);
+            if (q > k && square >= room * room) continue;
+            if (count == w->neighbour_room) return FULL;
+            w->neighbour[count++] = q;
+            if (q > k && square >= (horizon + reach) * (horizon + reach)) continue;
+            for (int i = w->bodies_at[k]; i < w->bodies_at[k + 1]; i++)
+                for (int j = q > k ? w->bodies_at[q] : i + 1; j < w->bodies_at[q + 1]; j++) {
+                    int first = w->part_bodies[i], second = w->part_bodies[j];
+                    int a = first < second ? first : second, b = first + second - a;
+                    if (list_if_near(w, p, a, b, w->axis + AXIS * b, w->radius[a] + w->radius[b], horizon)) return FULL;
+                }
+        }
+    }
+    w->neighbours_at[w->parts] = count;
+    sort_pairs(w, 1);
+    measure_parts(w);
+    w->self_far = horizon;
+    return DONE;
+}
+
+/* Write the axes of all bodies at the present place. */
+static void place_axes(Way *w)
+{
+    for (int b = 0; b < w->bodies; b++) {
+        const double *p = w->place + 3 * w->ends[2 * b], *q = w->place + 3 * w->ends[2 * b + 1];
+        double *axis = w->axis + AXIS * b;
+        for (int a = 0; a < 3; a++) {
+            axis[a] = 0.5 * (p[a] + q[a]);
+            axis[3 + a] = 0.5 * (q[a] - p[a]);
+        }
+        axis[6] = norm(axis + 3, 3) + w->radius[b];
+    }
+}
+
+/* The least bound of the distances of pairs that are not listed, where those nearer than `wanted` are evaluated. */
+static double ample(const Way *w, double wanted)
+{
+    return fmax(fmax(wanted, fmin(AMPLE * wanted, w->most)), 0.0);
+}
+
+/* List pairs anew at the present place, if others may be nearer than is needed there. */
+static int list_near(Way *w, double needed, double self_needed)
+{
+    int code = DONE, has_axes = 0;
+    /* NaN fails the comparisons. */
+    if (!(w->far >= needed)) {
+        place_axes(w);
+        has_axes = 1;
+        w->reach = -INFINITY;
+        code = list_solids(w, fmax(needed, w->influence) + w->slack);
+    }
+    if (code || !w->among) return code;
+    if (w->parted < self_needed) {
+        place_parts(w);
+        measure_parts(w);
+    }
+    if (self_far_of(w) >= self_needed) return DONE;
+    if (!has_axes) place_axes(w);
+    w->self_reach = -INFINITY;
+    return list_bodies(w, fmax(self_needed, w->self_influence) + w->slack);
 }
 
 /* Replace points by where they are at a time from the piece of pair k: in a frame that moves with that, and is the
    world's at time 0. */
-static void from_piece(const Pairs *p, int k, double time, int points, double *x)
+static void from_piece(const Way *w, const Pairs *p, int k, double time, int points, double *x)
 {
-    if (!p->velocity) return;
-    for (int i = 0; i < 3 * points; i++) x[i] -= time * p->velocity[3 * k + i % 3];
+    if (p->is_self || w->fastest == 0.0) return;
+    for (int i = 0; i < 3 * points; i++) x[i] -= time * w->velocity[3 * p->listed[k].other + i % 3];
 }
 
 /* Evaluate pair k over a straight motion between two times, from the known normal at its start. */
-static int contact(Pairs *p, int k, const double *before, const double *after, double since, double until)
+static int contact(const Way *w, Pairs *p, int k, const double *before, const double *after, double since, double until)
 {
     for (int i = 0; i < 4; i++) {
-        memcpy(p->ends + 3 * i, before + 3 * p->points[4 * k + i], 3 * sizeof(double));
-        memcpy(p->ends + ENDS / 2 + 3 * i, after + 3 * p->points[4 * k + i], 3 * sizeof(double));
+        int point = 3 * point_of(w, p, k, i);
+        memcpy(p->ends + 3 * i, before + point, 3 * sizeof(double));
+        memcpy(p->ends + ENDS / 2 + 3 * i, after + point, 3 * sizeof(double));
     }
-    from_piece(p, k, since, 4, p->ends);
-    from_piece(p, k, until, 4, p->ends + ENDS / 2);
-    memcpy(p->pair, p->known + KNOWN * k, KNOWN * sizeof(double));
+    from_piece(w, p, k, since, 4, p->ends);
+    from_piece(w, p, k, until, 4, p->ends + ENDS / 2);
+    if (!p->is_self) memcpy(p->pair, w->solid + SOLID * p->listed[k].other, SOLID * sizeof(double));
+    p->pair[SOLID] = thickness_of(w, p, k);
+    memcpy(p->pair + KNOWN_NORMAL, p->normal + 3 * k, 3 * sizeof(double));
     if (call(&p->contact)) return NO_VALUE;
-    memcpy(p->known + KNOWN * k + KNOWN_NORMAL, p->found + NORMAL, 3 * sizeof(double));
+    memcpy(p->normal + 3 * k, p->found + NORMAL, 3 * sizeof(double));
     return DONE;
 }
 
 /* The two ends of the body's axis (6) of pair k at `place`, for its `contact`: the nearest point twice where another
    contact has the other one. */
-static void ends_for(const Pairs *p, int k, const double *place, const double *contact, double *ends)
+static void ends_for(const Way *w, const Pairs *p, int k, const double *place, const double *contact, double *ends)
 {
-    const double *a = place + 3 * p->points[4 * k], *b = place + 3 * p->points[4 * k + 1];
+    const double *a = place + 3 * point_of(w, p, k, 0), *b = place + 3 * point_of(w, p, k, 1);
     double t = contact[2];
     int is_only = contact[CONTACT - 1] != 0.0;
     for (int i = 0; i < 3; i++) {
@@ -243,16 +423,16 @@ static void axis_of(const double *ends, double scale, double *axis)
    no greater than `flaw`, and the axes are further apart than `apart`. Return whether it is. */
 static int prove(const Way *w, Pairs *p, int k, const double *answer, double flaw, double apart, double *contact)
 {
-    const double *known = p->known + KNOWN * k, *place = w->place;
-    double *pair = p->proof_pair, *radius = pair + (p->is_self ? 12 : KNOWN_NORMAL - 1 + 6);
-    ends_for(p, k, place, contact, pair);
+    const double *place = w->place;
+    double *pair = p->proof_pair, *radius = pair + (p->is_self ? 12 : SOLID + 6);
+    ends_for(w, p, k, place, contact, pair);
     if (p->is_self)
-        for (int i = 0; i < 2; i++) memcpy(pair + 6 + 3 * i, place + 3 * p->points[4 * k + 2 + i], 3 * sizeof(double));
-    else memcpy(pair + 6, known, (KNOWN_NORMAL - 1) * sizeof(double));
-    *radius = known[KNOWN_NORMAL - 1];
+        for (int i = 0; i < 2; i++) memcpy(pair + 6 + 3 * i, place + 3 * point_of(w, p, k, 2 + i), 3 * sizeof(double));
+    else memcpy(pair + 6, w->solid + SOLID * p->listed[k].other, SOLID * sizeof(double));
+    *radius = thickness_of(w, p, k);
     memcpy(p->answer, answer, 7 * sizeof(double));
-    from_piece(p, k, w->time, 2, pair);
-    from_piece(p, k, w->time, 2, p->answer + 1);
+    from_piece(w, p, k, w->time, 2, pair);
+    from_piece(w, p, k, w->time, 2, p->answer + 1);
     if (call(&p->proof)) return 0;
     /* NaN fails the comparisons. */
     if (!(p->proven[CONTACT - 1] <= flaw && p->proven[0] + *radius > apart)) return 0;
@@ -271,30 +451,30 @@ static int evaluate(const Way *w, Pairs *p, double floor, double limit, double r
     int is_known = 1;
     if (p->is_close) reach = limit;
     for (int k = 0; k < p->count; k++) {
-        int a = p->body[k], b = p->other[k];
+        int a = p->listed[k].body, b = p->listed[k].other;
         double nearer = w->moved[a];
         if (p->is_self)
             nearer = sqrt(square_of(w->middle + 3 * a, w->middle + 3 * b)) + w->turned[a] + w->turned[b];
-        else if (p->velocity) nearer += p->speed[k] * fabs(w->until - w->since);
-        p->lower[k] -= nearer;
+        else nearer += w->speed[b] * fabs(w->until - w->since);
+        p->listed[k].lower -= nearer;
         /* A negated comparison is true for NaN. */
-        if (!(p->lower[k] >= limit)) is_known = 0;
+        if (!(p->listed[k].lower >= limit)) is_known = 0;
     }
     p->near = p->is_close = p->overlaps = 0;
     p->lowest = INFINITY;
     if (is_known) return DONE;
     for (int k = 0; k < p->count; k++) {
-        if (p->lower[k] >= reach) continue;
-        if (contact(p, k, before, after, w->since, w->until)) return NO_VALUE;
+        if (p->listed[k].lower >= reach) continue;
+        if (contact(w, p, k, before, after, w->since, w->until)) return NO_VALUE;
         /* The known normal may be of long ago: that at the start of this motion proves more. */
-        if (p->found[CONTACTS] < floor && p->lower[k] < floor
-            && (contact(p, k, before, before, w->since, w->since) || contact(p, k, before, after, w->since, w->until)))
+        if (p->found[CONTACTS] < floor && p->listed[k].lower < floor
+            && (contact(w, p, k, before, before, w->since, w->since) || contact(w, p, k, before, after, w->since, w->until)))
             return NO_VALUE;
         memcpy(p->contacts + CONTACTS * p->near, p->found, CONTACTS * sizeof(double));
         /* The bound from the motion alone holds as well. */
-        double bound = p->found[CONTACTS] > p->lower[k] ? p->found[CONTACTS] : p->lower[k];
+        double bound = p->found[CONTACTS] > p->listed[k].lower ? p->found[CONTACTS] : p->listed[k].lower;
         p->lowest = least_of(p->lowest, bound);
-        p->lower[k] = p->found[0];
+        p->listed[k].lower = p->found[0];
         if (!(p->found[0] > 0.0)) p->overlaps = 1;
         least = least_of(least, p->found[0]);
         p->rows[p->near++] = k;
@@ -305,7 +485,7 @@ static int evaluate(const Way *w, Pairs *p, double floor, double limit, double r
 
 /* Follow the path to its end, or to the end of the first piece that is not proven to keep the floors. The place that is
    reached becomes the present one. */
-EXPORT int follow(Way *w)
+static int follow(Way *w)
 {
     int step = 3 * w->points, is_proven = 1;
     double square = 0.0;
@@ -322,7 +502,7 @@ EXPORT int follow(Way *w)
         double furthest = greatest(w->moved, w->bodies);
         w->far -= furthest + w->fastest * fabs(w->until - w->since);
         w->parted -= 2.0 * furthest;
-        if (w->parts) w->self_far -= bending(w, before, after);
+        if (isfinite(w->self_far)) w->self_far -= bending(w, before, after);
         if (!(w->far >= w->floor && self_far_of(w) >= w->self_floor)) is_proven = 0;
         for (int g = 0; g < w->groups; g++) {
             Pairs *pairs = w->group[g];
@@ -350,4 +530,62 @@ static int advance_pairs(Way *w)
     w->limit = fmax(w->wanted, w->floor);
     w->self_limit = fmax(w->self_wanted, w->self_floor);
     return follow(w);
+}
+
+/* Follow the path from the present place as advance_pairs does, after pairs were listed that may come near on it. */
+EXPORT int prove_path(Way *w)
+{
+    int step = 3 * w->points;
+    double square = 0.0;
+    for (int k = step; k < (w->pieces + 1) * step; k += 3)
+        square = fmax(square, square_of(w->places + k % step, w->places + k));
+    /* Far motions are not proven by such lists. */
+    double furthest = fmin(AMPLE * sqrt(square), w->most), drift = w->fastest * fabs(w->end - w->start);
+    int code = list_near(w, fmax(w->floor, 0.0) + furthest + drift, fmax(w->self_floor, 0.0) + 2.0 * furthest);
+    return code ? code : advance_pairs(w);
+}
+
+/* Whether the present place and time are these, where pairs were evaluated. */
+static int is_at(const Way *w, const double *place, double time)
+{
+    return !w->lost && w->time == time && !memcmp(w->place, place, sizeof(double) * 3 * w->points);
+}
+
+/* Go straight to `place` at a time, where the pairs that are wanted are evaluated. */
+static int go_to(Way *w, const double *place, double time)
+{
+    size_t size = sizeof(double) * 3 * w->points;
+    memcpy(w->line, w->place, size);
+    memcpy(w->line + 3 * w->points, place, size);
+    w->pieces = 1;
+    w->places = w->line;
+    w->start = w->time;
+    w->end = time;
+    w->floor = w->self_floor = -INFINITY;
+    int code = advance_pairs(w);
+    return code == NOT_PROVEN ? DONE : code;
+}
+
+/* Make `place` and a time the present ones, with all pairs nearer than the limits evaluated, and those listed that can be
+   near in a step from there. */
+static int see(Way *w, const double *place, double time, double limit, double self_limit)
+{
+    int code = DONE;
+    if (w->lost) {
+        for (int g = 0; g < w->groups; g++) clear(w->group[g]);
+        w->far = w->self_far = -INFINITY;
+        w->lost = 0;
+    }
+    w->wanted = fmax(w->wanted, limit);
+    w->self_wanted = fmax(w->self_wanted, self_limit);
+    if (!is_at(w, place, time)) code = go_to(w, place, time);
+    if (!code) code = list_near(w, ample(w, w->wanted), ample(w, w->self_wanted));
+    if (code || (limit <= w->reach && self_limit <= w->self_reach)) return code;
+    return go_to(w, place, time);
+}
+
+/* See the first of the places at a time. */
+EXPORT int see_place(Way *w, double time, double limit, double self_limit)
+{
+    return see(w, w->places, time, limit, self_limit);
 }

@@ -66,12 +66,12 @@ typedef struct {
     double *points, *next_points;          /* (P, 3) those of the bodies; the nodes where they are the same */
     double *places;                        /* (MOST_PIECES + 1, P, 3) */
 
-    /* Rows of clearance: their contacts (R, 9), numbers of group and pair, and in which round they were asked for, 0 in
-       none; middle and span of the body and of the other body (R, 12), and the answer (R, 7): a distance, a point of the
+    /* Rows of clearance: their contacts (R, 9), numbers of group and pair, in which round they were asked for, 0 in none,
+       and body, other and whether that is a body (R, 3); middle and span of the body and of the other body (R, 12), and the answer (R, 7): a distance, a point of the
        body and one of the other. Counts of rounds, of rows asked for, and of answers that were proven. */
     int room, round, asked_for, proven;
     double *contacts, *questions, *answers;
-    int *group, *pair, *asked;
+    int *group, *pair, *asked, *named;
 
     /* Whether the QP corrects what one before it left, and whether the last answer was settled; the points (P, 3) and the
        nodes (N, 3) where the QP is linearised, and the time. */
@@ -124,7 +124,7 @@ static int clearance_row(StepData *s, int k)
     int *nodes = f->near_nodes + s->slots * k;
     double *rows = f->near_rows + 3 * s->slots * k, part[3];
     for (int i = 0; i < 4; i++) {
-        int point = p->points[4 * s->pair[k] + i];
+        int point = point_of(s->way, p, s->pair[k], i);
         for (int a = 0; a < 3; a++) part[a] = contact[1 + i] * normal[a];
         if (s->end.eval) {
             if (over_nodes(s, point, part, nodes + 3 * i, rows + 9 * i)) return NO_VALUE;
@@ -136,7 +136,7 @@ static int clearance_row(StepData *s, int k)
     double lower = (p->is_self ? s->self_safe : s->safe) + s->margin - contact[0];
     if (!s->corrects) {
         lower = fmin(lower, 2.0 * s->margin);
-        if (p->velocity) lower += s->duration * dot(normal, p->velocity + 3 * s->pair[k], 3);
+        if (!p->is_self) lower += s->duration * dot(normal, s->way->velocity + 3 * p->listed[s->pair[k]].other, 3);
         lower = fmax(lower, fmin(s->share_of_way * lower, -s->least_way));
     }
     f->near_lower[k] = lower;
@@ -149,12 +149,6 @@ static int clearance_row(StepData *s, int k)
     return DONE;
 }
 
-/* Whether the points of the way are at `place`, at that time. */
-static int is_at(const StepData *s, const double *place, double time)
-{
-    return s->way->time == time && !memcmp(s->way->place, place, sizeof(double) * s->span);
-}
-
 /* The rows of all contacts nearer than the limits. */
 static int list_rows(StepData *s)
 {
@@ -163,9 +157,8 @@ static int list_rows(StepData *s)
     s->fused->slots = s->slots;
     s->fused->near = s->round = s->asked_for = s->proven = 0;
     if (!w) return DONE;
-    if (!(s->limit <= w->reach && s->self_limit <= w->self_reach)
-        || !is_at(s, s->at, s->at_time))
-        return ELSEWHERE;
+    int code = see(w, s->at, s->at_time, s->limit, s->self_limit);
+    if (code) return code;
     for (int g = 0; g < w->groups; g++) {
         const Pairs *p = w->group[g];
         double limit = p->is_self ? s->self_limit : s->limit;
@@ -177,6 +170,9 @@ static int list_rows(StepData *s)
             memcpy(s->contacts + CONTACT * count, contact, CONTACT * sizeof(double));
             s->group[count] = g;
             s->pair[count] = (int)p->rows[i >> 1];
+            s->named[3 * count] = p->listed[s->pair[count]].body;
+            s->named[3 * count + 1] = p->listed[s->pair[count]].other;
+            s->named[3 * count + 2] = p->is_self;
             s->asked[count] = 0;
             if (clearance_row(s, count++)) return NO_VALUE;
         }
@@ -286,11 +282,11 @@ static int ask_for(StepData *s, int all)
         if (s->asked[k] || !(all || fabs(multiplier[k]) > 0.0)) continue;
         const Pairs *p = s->way->group[s->group[k]];
         double ends[6];
-        ends_for(p, s->pair[k], s->at, s->contacts + CONTACT * k, ends);
+        ends_for(s->way, p, s->pair[k], s->at, s->contacts + CONTACT * k, ends);
         axis_of(ends, s->scale, s->questions + 12 * k);
         if (p->is_self) {
             for (int i = 0; i < 2; i++)
-                memcpy(ends + 3 * i, s->at + 3 * p->points[4 * s->pair[k] + 2 + i], 3 * sizeof(double));
+                memcpy(ends + 3 * i, s->at + 3 * point_of(s->way, p, s->pair[k], 2 + i), 3 * sizeof(double));
             axis_of(ends, s->scale, s->questions + 12 * k + 6);
         }
         s->asked[k] = s->round;
@@ -482,23 +478,9 @@ static int is_clear(const StepData *s)
         const Pairs *p = s->way->group[g];
         double floor = (p->is_self ? s->self_safe : s->safe) - s->rounding;
         for (int k = 0; k < p->count; k++)
-            if (!(p->lower[k] >= floor)) return 0;
+            if (!(p->listed[k].lower >= floor)) return 0;
     }
     return 1;
-}
-
-/* Lead the way straight to `place` at a time, where the pairs that are wanted are evaluated. */
-static int lead_to(StepData *s, const double *place, double time)
-{
-    Way *w = s->way;
-    memcpy(s->places, w->place, sizeof(double) * s->span);
-    memcpy(s->places + s->span, place, sizeof(double) * s->span);
-    w->pieces = 1;
-    w->places = s->places;
-    w->start = w->time;
-    w->end = time;
-    w->floor = w->self_floor = -INFINITY;
-    return advance_pairs(w);
 }
 
 /* Prove the way to the next state in a number of pieces on which q moves straight, each with `spare` added to its floors. */
@@ -508,7 +490,7 @@ static int pass(StepData *s, int pieces, double spare)
     Way *w = s->way;
     int size = s->span;
     /* A try before this one may have led away. */
-    int code = is_at(s, s->points, s->time) ? DONE : lead_to(s, s->points, s->time);
+    int code = is_at(w, s->points, s->time) ? DONE : go_to(w, s->points, s->time);
     if (code) return code;
     memcpy(s->places, s->points, sizeof(double) * size);
     for (int k = 1; k < pieces; k++) {
@@ -523,14 +505,15 @@ static int pass(StepData *s, int pieces, double spare)
     w->end = s->next_time;
     w->floor = s->safe + spare;
     w->self_floor = fmax(s->self_safe + spare, 0.0);
-    return advance_pairs(w);
+    return prove_path(w);
 }
 
 /* Whether the next state, the way to which is proven or not, as `code` says, keeps all clearances itself. */
 static int judge(StepData *s, int code)
 {
-    if (code == NOT_PROVEN && !is_at(s, s->next_points, s->next_time) && lead_to(s, s->next_points, s->next_time)) return NOT_PROVEN;
     if (code && code != NOT_PROVEN) return code;
+    int other = code ? see(s->way, s->next_points, s->next_time, s->safe, s->self_safe) : DONE;
+    if (other) return other == FULL ? FULL : NOT_PROVEN;
     return is_clear(s) ? code : TOO_NEAR;
 }
 
@@ -659,7 +642,6 @@ EXPORT int resume(StepData *s)
 EXPORT int correct(StepData *s)
 {
     Fused *f = s->fused;
-    Way *w = s->way;
     double mark = now(), **arg = (double **)f->condense.arg;
     const double *q = s->settled ? f->q : f->started;
     if (!s->settled && put_nodes(s, q)) return NO_VALUE;
@@ -686,11 +668,5 @@ EXPORT int correct(StepData *s)
     /* A pair that one correction pushed apart must stay listed for the next, or two corrections alternate. */
     s->reach = fmax(s->reach, f->furthest);
     set_limits(s, 0.0);
-    if (w && !(s->limit <= w->reach && s->self_limit <= w->self_reach && is_at(s, s->at, s->at_time))) {
-        w->wanted = s->limit;
-        w->self_wanted = s->self_limit;
-        int code = lead_to(s, s->at, s->at_time);
-        if (code) return code;
-    }
     return solve_step(s, &mark);
 }

@@ -45,7 +45,7 @@ _AGAIN = Code.UNSETTLED, Code.TOO_NEAR, Code.OFF_CURVE
 _SETTLED = Code.NOT_PROVEN, Code.TOO_NEAR, Code.OFF_CURVE
 """How a call ends whose answer was settled, but is no step yet."""
 
-_WANTING = Code.ASKS, Code.CROWDED
+_WANTING = Code.ASKS, Code.CROWDED, Code.FULL
 """How a call ends that is to be answered, and goes on then."""
 
 PHASES = "distance", "qp", "acceptance"
@@ -171,17 +171,10 @@ class Driver:
         if watch is None:
             data.way = 0
         else:
-            at = state.nodes if arrays.points is None else arrays.points
-            data.way = watch.started(at, state.time).address
+            data.way = watch.started(state.nodes if arrays.points is None else arrays.points).address
             watch.refresh()
         code = self._called(self._arrays.take)
         if not code:
-            return self._passage(state, target)
-        if code == Code.ELSEWHERE:
-            assert watch is not None
-            data.way = watch.move_to(at, state.time, data.limit, data.self_limit).address
-            code = self._called(self._arrays.take)
-        if code == Code.DONE:
             return self._passage(state, target)
         if not self._solver.corrects and not (data.settled and code in _SETTLED):
             return None
@@ -203,9 +196,13 @@ class Driver:
             if code == Code.ASKS:
                 self._ask()
                 code = self._arrays.resume()
-            else:
+                continue
+            if code == Code.CROWDED:
                 self._arrays.make_room(2 * data.room)
-                code = call()
+            else:
+                assert self._watch is not None
+                self._watch.make_room()
+            code = call()
         if data.asked_for and (not code or code in _AGAIN):
             fcl = self._setup.monitor.scene.fcl
             assert fcl is not None
@@ -331,13 +328,12 @@ class Driver:
 
     def _ask(self) -> None:
         """Have FCL answer the questions of this round."""
-        began, watch, fcl = perf_counter(), self._watch, self._setup.monitor.scene.fcl
-        assert watch is not None
+        began, fcl = perf_counter(), self._setup.monitor.scene.fcl
         assert fcl is not None
         asked = self._arrays.asked[: self._work.data.near] == self._arrays.data.round
         for k in asked.nonzero()[0].tolist():
-            group = watch.groups[self._arrays.group[k]].group
-            piece = None if group.is_self else int(group.other[self._arrays.pair[k]])
+            _, other, is_self = self._arrays.named[k].tolist()
+            piece = None if is_self else other
             fcl.answer(self._arrays.questions[k], piece, self._arrays.data.at_time, self._arrays.answers[k])
         self.spent[0] += perf_counter() - began
 
@@ -346,14 +342,11 @@ class Driver:
         near, work = int(self._work.data.near), self._work
         if not near or self._watch is None:
             return _NO_ROWS
-        # The pairs of a group change where they are listed anew; its arrays then are others.
-        names = self._setup.monitor.names
-        groups = [(pairs.body, pairs.other, pairs.group.is_self) for pairs in self._watch.groups]
-        group, pair = self._arrays.group[:near].copy(), self._arrays.pair[:near].copy()
+        names, named = self._setup.monitor.names, self._arrays.named[:near].copy()
 
         def name(k: int) -> str:
-            (body, other, is_self), row = groups[group[k]], pair[k]
-            return names.clearance(Pair(int(body[row]), int(other[row]), is_self))
+            body, other, is_self = named[k].tolist()
+            return names.clearance(Pair(body, other, bool(is_self)))
 
         data = self._arrays.data
         return ClearanceRows(

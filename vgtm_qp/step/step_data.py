@@ -61,7 +61,7 @@ class StepData:
         Of the bodies, m, where these are not the nodes.
     is_placed : bool
         Whether the configuration is the nodes.
-    contacts, questions, answers, group, pair, asked
+    contacts, questions, answers, group, pair, asked, named
         One row for each of the rows of clearance; see ``step.c``.
     """
 
@@ -148,6 +148,7 @@ class StepData:
         self._work.reserve(rows, _SLOTS if self._ends is None else 3 * _SLOTS)
         self.contacts, self.questions, self.answers = (np.zeros((rows, n)) for n in (CONTACT, 12, 7))
         self.group, self.pair, self.asked = (np.zeros(rows, dtype=np.int32) for _ in range(3))
+        self.named = np.zeros((rows, 3), dtype=np.int32)
         self.program.set(
             contacts=self.contacts,
             questions=self.questions,
@@ -155,6 +156,7 @@ class StepData:
             group=self.group,
             pair=self.pair,
             asked=self.asked,
+            named=self.named,
             room=rows,
         )
 
