@@ -69,3 +69,8 @@ def test_a_larger_or_smaller_arm_moves_in_the_same_way(name, factor):
     assert second.certificate.failures() == first.certificate.failures()
     stops = [each.manifest["stop"] or {} for each in (first, second)]
     assert stops[0].get("kind") == stops[1].get("kind")
+
+
+def test_so_it_does_without_a_compiler(monkeypatch):
+    monkeypatch.setenv("VGTM_CC", "none")
+    test_a_larger_or_smaller_arm_moves_in_the_same_way(PROBLEMS[0], 1e-3)

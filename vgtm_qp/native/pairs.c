@@ -11,6 +11,10 @@ enum { AXIS = 7 };
 /* Least bound of the distances of pairs that are not listed, over the distance below which pairs are evaluated. */
 static const double AMPLE = 1.3;
 
+/* Motions as the greatest of late for which pairs of bodies are listed, the least share of the slack for which they are,
+   and the share of that greatest motion that counts in the next one. */
+static const double LASTING = 20.0, LEAST_SLACK = 0.1, OF_LATE = 0.9;
+
 /* The lesser of two numbers; NaN if either is NaN. */
 static double least_of(double a, double b)
 {
@@ -84,6 +88,7 @@ typedef struct {
     /* Lower bounds of the distances of pairs that are not listed: from pieces; between bodies in parts of the arm that
        are near to each other, and in others. */
     double far, self_far, parted;
+    double bent;                     /* the greatest of late by which two bodies of near parts came nearer in a motion */
     /* The parts: their points and bodies, and where they begin; the greatest radius of their bodies; the later parts that
        each is near to, itself the first of them. */
     int parts, neighbour_room;
@@ -348,14 +353,15 @@ static double ample(const Way *w, double wanted)
     return fmax(fmax(wanted, fmin(AMPLE * wanted, w->most)), 0.0);
 }
 
-/* List pairs anew at the present place, if others may be nearer than is needed there. */
-static int list_near(Way *w, double needed, double self_needed)
+/* List pairs anew at the present place, if others may be nearer there than `least`, or come near soon. */
+static int list_near(Way *w, double least, double self_least)
 {
-    int code = DONE, has_axes = 0;
-    /* NaN fails the comparisons. */
-    if (!(w->far >= needed)) {
+    double needed = fmax(least, ample(w, w->wanted)), self_needed = fmax(self_least, ample(w, w->self_wanted));
+    double slack = fmin(w->slack, fmax(LASTING * w->bent, LEAST_SLACK * w->slack));
+    double horizon = fmax(self_needed, w->self_influence) + slack;
+    int code = DONE, is_short = !(w->far >= needed);        /* NaN fails the comparison */
+    if (is_short) {
         place_axes(w);
-        has_axes = 1;
         w->reach = -INFINITY;
         code = list_solids(w, fmax(needed, w->influence) + w->slack);
     }
@@ -364,10 +370,12 @@ static int list_near(Way *w, double needed, double self_needed)
         place_parts(w);
         measure_parts(w);
     }
-    if (self_far_of(w) >= self_needed) return DONE;
-    if (!has_axes) place_axes(w);
+    /* A list of many pairs that bodies hardly approach costs more in each motion than a new one does once. */
+    int is_long = w->self_far < INFINITY && w->self_far > horizon + slack;
+    if (self_far_of(w) >= self_needed && !is_long) return DONE;
+    if (!is_short) place_axes(w);
     w->self_reach = -INFINITY;
-    return list_bodies(w, fmax(self_needed, w->self_influence) + w->slack);
+    return list_bodies(w, horizon);
 }
 
 /* Replace points by where they are at a time from the piece of pair k: in a frame that moves with that, and is the
@@ -502,7 +510,11 @@ static int follow(Way *w)
         double furthest = greatest(w->moved, w->bodies);
         w->far -= furthest + w->fastest * fabs(w->until - w->since);
         w->parted -= 2.0 * furthest;
-        if (isfinite(w->self_far)) w->self_far -= bending(w, before, after);
+        if (isfinite(w->self_far)) {
+            double nearer = bending(w, before, after);
+            w->self_far -= nearer;
+            w->bent = fmax(nearer, OF_LATE * w->bent);
+        }
         if (!(w->far >= w->floor && self_far_of(w) >= w->self_floor)) is_proven = 0;
         for (int g = 0; g < w->groups; g++) {
             Pairs *pairs = w->group[g];
@@ -579,7 +591,7 @@ static int see(Way *w, const double *place, double time, double limit, double se
     w->wanted = fmax(w->wanted, limit);
     w->self_wanted = fmax(w->self_wanted, self_limit);
     if (!is_at(w, place, time)) code = go_to(w, place, time);
-    if (!code) code = list_near(w, ample(w, w->wanted), ample(w, w->self_wanted));
+    if (!code) code = list_near(w, 0.0, 0.0);
     if (code || (limit <= w->reach && self_limit <= w->self_reach)) return code;
     return go_to(w, place, time);
 }

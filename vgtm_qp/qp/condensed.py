@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from vgtm_qp.arrays import Array
 from vgtm_qp.qp.answer import StepSolution
-from vgtm_qp.qp.daqp import DAQP
+from vgtm_qp.qp.daqp import DAQP, fitted
 from vgtm_qp.qp.dense import EQUALITY, DenseSolver, check
 from vgtm_qp.qp.full import FullBuilder, StepQP
 from vgtm_qp.qp.layout import Layout
@@ -27,7 +27,7 @@ class CondensedSolver:
     settles = "equalities"
 
     def __init__(self, layout: Layout, solver: DenseSolver = DAQP) -> None:
-        self.layout, self._solver = layout, solver
+        self.layout, self._solver = layout, fitted(solver, layout.arm.fineness)
         self.builder = builder = FullBuilder(layout)
         actuators, slack = builder.column["actuators"], builder.column["slack"]
         # The columns that the condensed QP keeps, before and after the free coordinates of the curve.

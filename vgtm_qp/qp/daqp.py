@@ -7,14 +7,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.arrays import Array
-from vgtm_qp.qp.dense import DenseAnswer
+from vgtm_qp.qp.dense import DenseAnswer, DenseSolver
 from vgtm_qp.qp.residual import CONTRADICTION, InfeasibleStepError
 
 
 class Daqp:
-    """See :class:`vgtm_qp.qp.dense.DenseSolver`; its answers are not checked yet."""
+    """See :class:`vgtm_qp.qp.dense.DenseSolver`; for arms of a `fineness`. Its answers are not checked yet."""
 
-    accuracy = 1e-10
+    def __init__(self, fineness: float = 1.0) -> None:
+        self.accuracy = 1e-10 * fineness
 
     def ask(
         self,
@@ -37,3 +38,8 @@ class Daqp:
 
 DAQP = Daqp()
 """The default solver."""
+
+
+def fitted(solver: DenseSolver, fineness: float) -> DenseSolver:
+    """Return the default solver with the accuracy that arms of a `fineness` need; any other one as it is."""
+    return Daqp(fineness) if solver is DAQP else solver

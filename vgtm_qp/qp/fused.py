@@ -23,7 +23,7 @@ from vgtm_qp.errors import EvaluationError
 from vgtm_qp.native import Code, Program, building
 from vgtm_qp.qp.answer import Accuracy, Closed, CurvePoint, Move, Settled, StepSolution
 from vgtm_qp.qp.curve_rows import curve_function, point_function
-from vgtm_qp.qp.daqp import DAQP
+from vgtm_qp.qp.daqp import DAQP, Daqp
 from vgtm_qp.qp.dense import EQUALITY, DenseSolver
 from vgtm_qp.qp.fused_rows import RESULTS, row_function
 from vgtm_qp.qp.layout import Layout
@@ -541,7 +541,7 @@ def _numbers(layout: Layout) -> dict[str, Any]:
         "closing_steps": MOST_STEPS,
         "too_far": TOO_FAR * arm.unit,
         "small_error": _SMALL_ERROR * arm.unit,
-        "feasibility": DAQP.accuracy * arm.fineness,
+        "feasibility": Daqp(arm.fineness).accuracy,
         "places": len(place),
         "place": place,
         "of": of,

@@ -12,7 +12,7 @@ from vgtm_qp.arrays import Array, Index
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.native import Code, CompiledKernel, Program, building
 from vgtm_qp.qp.answer import Accuracy, Closed, Move, StepSolution
-from vgtm_qp.qp.daqp import DAQP
+from vgtm_qp.qp.daqp import Daqp
 from vgtm_qp.qp.fused import daqp_addresses, placement
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.linearise import StepInput
@@ -59,7 +59,7 @@ class CompiledChain:
         self._functions = {name: Kernel(function) for name, function in self._given.items()}
         self._functions["values"] = Kernel(period_values(self._chain))
         self.library = building()
-        self._is_ready = None if solver.dense is DAQP and daqp_addresses() else False
+        self._is_ready = None if isinstance(solver.dense, Daqp) and daqp_addresses() else False
         self._accuracy: Accuracy | None = None
 
     @property
@@ -425,7 +425,7 @@ def _tolerances(layout: Layout) -> dict[str, Any]:
     arm = layout.arm
     return {
         "presses": PRESSES,
-        "accuracy": DAQP.accuracy,
+        "accuracy": Daqp(arm.fineness).accuracy,
         "no_row": NO_ROW,
         "dependent": DEPENDENT,
         "independent": INDEPENDENT,

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.errors import SolverError
 from vgtm_qp.qp.answer import StepSolution
+from vgtm_qp.qp.daqp import fitted
 from vgtm_qp.qp.dense import DenseSolver
 from vgtm_qp.qp.long.chain_data import ChainData
 from vgtm_qp.qp.long.elimination import Elimination
@@ -51,9 +52,10 @@ class ChainSolver(ABC):
     def __init__(
         self, elimination: Elimination, size: int, solver: DenseSolver, *, is_reversed: bool
     ) -> None:
-        self.dense, self.elimination = solver, elimination
+        self.elimination = elimination
         chain = self.chain = elimination.chain
         self.layout = chain.layout
+        self.dense = fitted(solver, self.layout.arm.fineness)
         self.data = ChainData(chain, elimination.inputs.sizes, is_reversed=is_reversed)
         self._size, self._curve = size, elimination.curve
         self._free = np.zeros(self._curve)
