@@ -76,7 +76,7 @@ def is_ready(shapes: Iterable[str]) -> bool:
     return library.library is not None
 
 
-class Pairs:
+class ListedPairs:
     """The listed pairs of one shape, with bounds and contacts of the last evaluation: arrays that C fills."""
 
     def __init__(self, scene: Scene, shape: str) -> None:
@@ -150,7 +150,7 @@ class Watch:
 
     def __init__(self, scene: Scene, influence: float, self_influence: float) -> None:
         self._scene, self._influence, self._self_influence = scene, influence, self_influence
-        self._pairs: dict[str, Pairs] = {}
+        self._pairs: dict[str, ListedPairs] = {}
         self._way: Program | None = None
         self._put()
 
@@ -158,7 +158,7 @@ class Watch:
         """Allocate what the shapes of the scene need."""
         for shape in self._scene.shapes:
             if shape not in self._pairs:
-                self._pairs[shape] = Pairs(self._scene, shape)
+                self._pairs[shape] = ListedPairs(self._scene, shape)
         self._groups = [self._pairs[shape] for shape in self._scene.shapes]
 
     def forget_pieces(self) -> None:
