@@ -15,6 +15,7 @@ from vgtm_qp.certify.trajectory import Columns, Trajectory, given_trajectory, re
 from vgtm_qp.certify.verdict import Finding, Verdict
 from vgtm_qp.errors import Mistake
 from vgtm_qp.result.chain import RecordedChain
+from vgtm_qp.result.poses import arm_table
 
 if TYPE_CHECKING:
     from vgtm_qp.certify.motion import GivenMotion
@@ -80,7 +81,6 @@ class Certifier:
         from vgtm_qp.certify.angles import keep_angles
         from vgtm_qp.certify.decide import decide
         from vgtm_qp.certify.limits import beyond_limits
-        from vgtm_qp.certify.truss_motion import TrussMotion
 
         began = time.perf_counter()
         values = self._quantities(trajectory)
@@ -92,8 +92,7 @@ class Certifier:
         for decision in decided.values():
             wrong += decision.violations
             doubt += decision.undecided
-        if isinstance(motion, TrussMotion):
-            doubt += motion.doubts()
+        doubt += () if motion is None else motion.doubts()
         # Where the motion is unknown, bodies may be anywhere.
         least = -np.inf if any(finding.kind == "motion" for finding in doubt) else np.inf
         bounds = {kind: min(decision.bound, least) for kind, decision in decided.items()}
@@ -109,17 +108,16 @@ class Certifier:
     def _quantities(self, trajectory: Trajectory) -> Array:
         """Return (T, M) the arm's quantities at the rows; joints that follow others need not be given."""
         values = trajectory.filled(self.arm.home_quantities)
-        if isinstance(self.arm, RecordedChain):
-            given = np.intersect1d(self.arm.followers[:, 0], trajectory.quantities)
-            values[:, given] = self.arm.quantities(values)[:, given]
+        given = np.intersect1d(self.arm.followers[:, 0], trajectory.quantities)
+        values[:, given] = self.arm.of_values(values)[:, given]
         return values
 
     def _motion(self, instants: Array, values: Array) -> tuple[GivenMotion | None, list[Finding]]:
         """Return the motion through all rows and changes of the base, and findings where it is unknown."""
         from vgtm_qp.certify.motion import JointMotion
 
-        table = self._table.get("truss") or self._table.get("arm") or {}
-        corners = np.array([0.0, *(pose["time"] for pose in table.get("base_motion") or ())])
+        base_motion = arm_table(self._table).get("base_motion") or ()
+        corners = np.array([0.0, *(pose["time"] for pose in base_motion)])
         inner = corners[(corners > instants[0]) & (corners < instants[-1])]
         knots = np.union1d(instants, inner)
         at_knots = np.stack([np.interp(knots, instants, column) for column in values.T], axis=1)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
 
 from vgtm_qp.arrays import Array, Index
+from vgtm_qp.certify.verdict import Finding
 from vgtm_qp.result.chain import RecordedChain
 from vgtm_qp.result.poses import base_poses
 from vgtm_qp.verify.arm import Arm
@@ -36,6 +37,10 @@ class GivenMotion(RecordedMotion):
     @abstractmethod
     def ends_at(self, segment: Index, share: Array) -> Array:
         """Return (U, B, 2, 3) the ends of the bodies, m, at shares (U,) of segments (U,)."""
+
+    def doubts(self) -> Iterator[Finding]:
+        """Yield where the bodies asked for were not found; by default nowhere."""
+        yield from ()
 
     def times_at(self, segment: Index, share: Array) -> Array:
         """Return (U,) the times, s, at shares (U,) of segments (U,)."""

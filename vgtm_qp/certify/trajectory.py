@@ -18,8 +18,8 @@ from vgtm_qp.errors import Mistake, ProblemError, nearest
 from vgtm_qp.problem.fields import GREATEST_LENGTH, quoted
 from vgtm_qp.problem.table import shown
 from vgtm_qp.problem.timed_rows import GREATEST_MISTAKES, NUMBER, read_timed_rows, time_mistakes
-from vgtm_qp.result.chain import RecordedChain
 from vgtm_qp.verify.arm import Arm
+from vgtm_qp.verify.check import locks_of
 
 if TYPE_CHECKING:
     from vgtm_qp.problem import Problem
@@ -46,21 +46,13 @@ class Columns:
     @classmethod
     def of(cls, arm: Arm, problem: Problem) -> Columns:
         """Return the columns of an arm's trajectories."""
-        stuck: set[str] = set()
-        if problem.truss is not None:
-            stuck = {lock.member for lock in problem.truss.locked}
-        chosen = [
-            k
-            for k, name in enumerate(arm.quantity_names)
-            if isinstance(arm, RecordedChain) or arm.actuated[k] or name in stuck
-        ]
-        turns = (
-            arm.revolute if isinstance(arm, RecordedChain) else np.zeros(len(arm.quantity_names), dtype=bool)
-        )
-        index = np.array(chosen, dtype=np.int64)
+        given = arm.actuated.copy()
+        given[arm.followers[:, 0]] = True
+        given[[arm.quantity_names.index(name) for name, _ in locks_of(problem.to_dict())]] = True
+        index = np.flatnonzero(given)
         return cls(
-            tuple(arm.quantity_names[k] for k in chosen),
-            tuple("rad" if turns[k] else "m" for k in chosen),
+            tuple(arm.quantity_names[k] for k in index),
+            tuple("rad" if arm.revolute[k] else "m" for k in index),
             index,
             np.asarray(arm.actuated[index]),
         )

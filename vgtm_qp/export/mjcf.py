@@ -11,7 +11,6 @@ import numpy as np
 from vgtm_qp.arrays import Array
 from vgtm_qp.errors import ExportError
 from vgtm_qp.result.chain import RecordedChain
-from vgtm_qp.result.poses import base_poses, rotations
 from vgtm_qp.result.result import Result
 from vgtm_qp.rotation import quaternion
 from vgtm_qp.verify.arm import Arm, RecordedArm, arm_of
@@ -72,8 +71,7 @@ def mjcf(maneuver: Result) -> str:
         A truss has offset joints, which point masses cannot orient, or a link of a serial arm stretches.
     """
     arm = modelled_arm(maneuver)
-    is_chain = isinstance(arm, RecordedChain)
-    name = str(maneuver.manifest["problem"].get("name", "arm" if is_chain else "truss"))
+    name = str(maneuver.manifest["problem"].get("name", "arm"))
     root = Element("mujoco", model=name)
     _add(root, "compiler", angle="radian", autolimits="true", boundmass=_LEAST_MASS, boundinertia=_LEAST_MASS)
     _add(root, "option", timestep=TIME_STEP, integrator="implicitfast", gravity=(0.0, 0.0, -9.81))
@@ -82,16 +80,14 @@ def mjcf(maneuver: Result) -> str:
     _add(world, "light", pos=(0.0, 0.0, 0.0), dir=(-0.3, 0.5, -0.8), directional="true", diffuse=_LIGHT)
     if isinstance(arm, RecordedChain):
         _add_joints(asset, world, arm, maneuver.manifest["problem"]["arm"]["joint"])
+        _add_drives(root, arm)
     else:
         _add_nodes(world, arm)
+        _add_members(root, arm)
     obstacles = drawing.obstacles
     tables = {entry["name"]: entry for entry in maneuver.manifest["problem"].get("obstacle") or ()}
     for mesh in obstacles:
         _add_obstacle(asset, world, mesh, tables[mesh.name], float(maneuver.time[0]))
-    if isinstance(arm, RecordedChain):
-        _add_drives(root, arm)
-    else:
-        _add_members(root, arm)
     _add_keyframes(root, maneuver, arm, [mesh for mesh in obstacles if mesh.velocity.any()])
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode") + "\n"
@@ -290,20 +286,13 @@ class _GivenPoses(NamedTuple):
     @classmethod
     def of(cls, maneuver: Result, arm: Arm, moving: Sequence[ObstacleMesh]) -> _GivenPoses:
         """Return the poses at a maneuver's states; a truss has base nodes, which do not turn, as its base."""
-        time = maneuver.time
-        if isinstance(arm, RecordedChain):
-            poses = base_poses(maneuver.manifest["problem"], time)
-            base, turns = poses[:, None, :3], quaternion(rotations(poses[:, 3:]))[:, None]
-        else:
-            base = maneuver.nodes[:, np.sort(arm.base)]
-            turns = np.zeros((len(time), base.shape[1], 4))
-            turns[..., 0] = 1.0
-        paths = np.array([[mesh.position(float(t)) for mesh in moving] for t in time]).reshape(
-            len(time), -1, 3
-        )
-        still = np.zeros((len(time), len(moving), 4))
-        still[..., 0] = 1.0
-        return cls(np.concatenate([base, paths], axis=1), np.concatenate([turns, still], axis=1))
+        time, base = maneuver.time, maneuver.nodes[:, np.sort(arm.base)]
+        paths = np.array([[mesh.position(float(t)) for mesh in moving] for t in time])
+        position = np.concatenate([base, paths.reshape(len(time), -1, 3)], axis=1)
+        turns = np.tile((1.0, 0.0, 0.0, 0.0), (*position.shape[:2], 1))
+        for _, attitude in arm.frames(maneuver.configurations)[:1]:
+            turns[:, 0] = quaternion(attitude)
+        return cls(position, turns)
 
 
 def _add(parent: Element, tag: str, **attributes: object) -> Element:

@@ -12,7 +12,6 @@ import numpy as np
 from vgtm_qp.arrays import Array
 from vgtm_qp.errors import ExportError, MissingExtraError
 from vgtm_qp.export.mjcf import ACTUATOR_GROUP, mjcf, modelled_arm
-from vgtm_qp.result.chain import RecordedChain
 from vgtm_qp.result.result import Result
 from vgtm_qp.verify.clearance import AgainstBody, RecordedMotion
 from vgtm_qp.verify.obstacles import read_obstacles
@@ -130,14 +129,11 @@ class _Simulation:
         manifest = maneuver.manifest
         directory = Path(manifest.get("directory") or ".")
         self._bodies = read_obstacles(manifest["problem"], manifest.get("meshes") or {}, directory)[0]
-        count, chain = len(maneuver.time), isinstance(self._arm, RecordedChain)
-        self._is_chain = chain
+        count = len(maneuver.time)
         self._wanted = maneuver.member_lengths if maneuver.joints is None else maneuver.joints
-        self._quantities = self._wanted
-        if isinstance(self._arm, RecordedChain):
-            self._quantities = self._arm.quantities(self._wanted)
-        # Equality constraints of tendons hold the difference to this length.
-        self._held_from = np.zeros(self._model.nq) if chain else np.array(self._model.tendon_length0)
+        # The model's equality constraints hold its home pose; those of tendons count from there.
+        moved = self._arm.of_values(self._wanted) - self._arm.home_quantities
+        self._held = moved + self._model.eq_data[:, 0]
         self._mocap = np.array(self._model.key_mpos).reshape(count, -1, 3)
         self._turned = np.array(self._model.key_mquat).reshape(count, -1, 4)
 
@@ -148,13 +144,12 @@ class _Simulation:
         tips, contacts = np.empty_like(maneuver.tip_position), 0
         for k in range(len(states)):
             contacts += move(k)
-            values[k] = self._data.qpos if self._is_chain else self._data.ten_length
             tips[k] = self._tip_now()
-            if self._is_chain:
-                # The base is where the problem moves it.
-                states[k, : values.shape[1]] = values[k]
+            if maneuver.joints is None:
+                values[k], states[k] = self._data.ten_length, self._data.site_xpos
             else:
-                states[k] = self._data.site_xpos
+                # The base is where the problem moves it.
+                values[k] = states[k, : values.shape[1]] = self._data.qpos
         errors = values - self._wanted
         motion = RecordedMotion(arm, maneuver.time, states)
         pairs = [AgainstBody(motion, body) for body in self._bodies]
@@ -232,8 +227,7 @@ class _Simulation:
     def _command(self, state: int, share: float) -> None:
         """Set lengths or joints, base and obstacles to a `share` of the motion from `state` to the next."""
         after = min(state + 1, len(self._mocap) - 1)
-        wanted = (1.0 - share) * self._quantities[state] + share * self._quantities[after]
-        self._model.eq_data[:, 0] = wanted - self._held_from
+        self._model.eq_data[:, 0] = (1.0 - share) * self._held[state] + share * self._held[after]
         self._data.mocap_pos[:] = (1.0 - share) * self._mocap[state] + share * self._mocap[after]
         # MuJoCo normalises quaternions.
         self._data.mocap_quat[:] = (1.0 - share) * self._turned[state] + share * self._turned[after]
@@ -244,9 +238,9 @@ class _Simulation:
         self._mujoco.mj_fwdPosition(self._model, self._data)
 
     def _tip_now(self) -> Array:
-        if self._is_chain:
-            return np.array(self._data.site("tip").xpos)
-        return np.asarray(self._arm.tip_position(np.asarray(self._data.site_xpos)))
+        if self._maneuver.joints is None:
+            return self._arm.tip_position(np.asarray(self._data.site_xpos))
+        return np.array(self._data.site("tip").xpos)
 
 
 def _mm(metres: float | None) -> str:

@@ -19,7 +19,6 @@ from vgtm_qp.live.surroundings import Surroundings
 from vgtm_qp.methods import Resolver, method_name
 from vgtm_qp.methods.presets import with_method
 from vgtm_qp.problem import Problem
-from vgtm_qp.result.chain import RecordedChain
 from vgtm_qp.rows.curve import fitted
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.setup import Setup
@@ -80,8 +79,7 @@ class Session(Surroundings):
     @property
     def nodes(self) -> Array:
         """(N, 3) the nodes that are drawn, m: of a serial arm those of its record, with all vertices of its hulls."""
-        arm = self.drawing.arm
-        return arm.placed(self.state.q[None])[0][0] if isinstance(arm, RecordedChain) else self.state.nodes
+        return np.asarray(self.drawing.arm.nodes_at(self.state.q[None])[0])
 
     @property
     def state(self) -> State:

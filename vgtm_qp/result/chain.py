@@ -150,34 +150,10 @@ class RecordedChain:
         ):
             found.append("the arm record's attitude of the tip differs from the problem's")
         if table.get("body") is not None:
-            return found + self._other_bodies(table["body"])
+            return found + _other_bodies(self, table["body"])
         if table.get("link_radius") is not None and not same(self.radius, table["link_radius"]):
             found.append("the arm record's link radius differs from the problem's")
         return found
-
-    def _other_bodies(self, table: Sequence[Mapping[str, Any]]) -> list[str]:
-        """Return where the bodies of the record differ from those of the problem's table."""
-        if tuple(str(body["name"]) for body in table) != self.member_names:
-            return ["the bodies of the arm record are not those of the problem"]
-        found, number = [], {name: k + 1 for k, name in enumerate(self.quantity_names)}
-        first = len(number) + 2
-        for k, body in enumerate(table):
-            ends, radius = np.array(body["points"], dtype=float), float(body.get("radius") or 0.0)
-            own = self.links[k] - first
-            carrier = number.get(str(body.get("joint")), 0)
-            if own.min() < 0 or (self.carriers[own] != carrier).any():
-                found.append(f"the arm record's joint of body {body['name']} differs from the problem's")
-            elif not same(self.radius[k], radius) or not self._is_shape(k, own, ends, radius):
-                found.append(f"the arm record's shape of body {body['name']} differs from the problem's")
-        return found
-
-    def _is_shape(self, link: int, own: Index, points: Array, radius: float) -> bool:
-        """Whether the recorded points `own` (V,) of a link are the `points` (K, 3) of its table, m."""
-        if len(points) <= 2:
-            return not self.is_hull[link] and _are_ends(self.points[own[:2]], points, radius)
-        count = len(points)
-        is_padded = count <= len(own) and bool((own[count:] == own[count - 1]).all())
-        return is_padded and same(self.points[own[:count]], points)
 
     def placed(self, q: Array) -> tuple[Array, Array, Array]:
         """Return base, joints, tip and points of bodies (Q, J + 2 + P, 3), m, axes (Q, J, 3), last frames (Q, 3, 3)."""
@@ -208,6 +184,14 @@ class RecordedChain:
             frames.append((at, frame))
         return points, axes, frames
 
+    def nodes_at(self, q: Array) -> Array:
+        """Return (Q, N, 3) base, joints, tip and points of bodies, m, at configurations (Q, J + 6)."""
+        return self.placed(q)[0]
+
+    def frames(self, q: Array) -> list[tuple[Array, Array]]:
+        """Return origins (Q, 3), m, and attitudes (Q, 3, 3) of what moves with the base and each joint."""
+        return self.along(q)[2]
+
     def ends(self, points: Array) -> Array:
         """Return (..., B, V, 3) the ends or vertices of the links for points (..., J + 2 + P, 3)."""
         return np.asarray(points[..., self.links, :])
@@ -217,8 +201,12 @@ class RecordedChain:
         return np.asarray(np.linalg.norm(np.ptp(self.ends(points), axis=-2), axis=-1))
 
     def quantities(self, q: Array) -> Array:
-        """Return (T, J) the quantities at configurations (T, J + 6), or joint values (T, J): see the class."""
-        values = np.array(q[:, : len(self.quantity_names)])
+        """Return (T, J) the quantities at configurations (T, J + 6): see the class."""
+        return self.of_values(q[:, : len(self.quantity_names)])
+
+    def of_values(self, values: Array) -> Array:
+        """Return (T, J) the quantities at joint values (T, J)."""
+        values = values.copy()
         values[:, self.followers[:, 0]] -= self.multipliers * values[:, self.followers[:, 1]]
         return values
 
@@ -256,7 +244,7 @@ class RecordedChain:
 
     def states_ends(self, q: Array) -> Array:
         """Return (T, B, V, 3) the ends or vertices of the links, m, at configurations (T, J + 6)."""
-        return self.ends(self.placed(q)[0])
+        return self.ends(self.nodes_at(q))
 
     def ends_between(self, before: Array, after: Array, share: Array, link: Index) -> Array:
         """Return (P, V, 3) the ends, m, of links (P,) at shares (P,) of a straight motion between states."""
@@ -344,6 +332,32 @@ def _driven(joints: Mapping[str, Mapping[str, Any]]) -> _Driven:
     for k, _ in rules:
         stroke[k], most[:, k] = (-np.inf, np.inf), np.inf
     return _Driven(home, stroke, most[0], most[1], followers, multipliers)
+
+
+def _other_bodies(chain: RecordedChain, table: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return where the bodies of the record differ from those of the problem's table."""
+    if tuple(str(body["name"]) for body in table) != chain.member_names:
+        return ["the bodies of the arm record are not those of the problem"]
+    found, number = [], {name: k + 1 for k, name in enumerate(chain.quantity_names)}
+    first = len(number) + 2
+    for k, body in enumerate(table):
+        ends, radius = np.array(body["points"], dtype=float), float(body.get("radius") or 0.0)
+        own = chain.links[k] - first
+        carrier = number.get(str(body.get("joint")), 0)
+        if own.min() < 0 or (chain.carriers[own] != carrier).any():
+            found.append(f"the arm record's joint of body {body['name']} differs from the problem's")
+        elif not same(chain.radius[k], radius) or not _is_shape(chain, k, own, ends, radius):
+            found.append(f"the arm record's shape of body {body['name']} differs from the problem's")
+    return found
+
+
+def _is_shape(chain: RecordedChain, link: int, own: Index, points: Array, radius: float) -> bool:
+    """Whether the recorded points `own` (V,) of a link are the `points` (K, 3) of its table, m."""
+    if len(points) <= 2:
+        return not chain.is_hull[link] and _are_ends(chain.points[own[:2]], points, radius)
+    count = len(points)
+    is_padded = count <= len(own) and bool((own[count:] == own[count - 1]).all())
+    return is_padded and same(chain.points[own[:count]], points)
 
 
 def _are_ends(recorded: Array, ends: Array, radius: float) -> bool:

@@ -27,13 +27,18 @@ def rotation_matrix(vector: Array) -> Array:
     return np.asarray(rotations(vector[None])[0])
 
 
+def arm_table(problem: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the table of a problem, as JSON data, that describes its arm; empty if it has none."""
+    return problem.get("truss") or problem.get("arm") or {}
+
+
 def base_poses(problem: Mapping[str, Any], times: Array) -> Array:
     """Return (T, 6) position, m, and rotation vector, rad, of the base relative to home at `times` (T,), s.
 
     From its home pose at time 0 on, a moving base goes from pose to pose on straight lines and single-axis
     rotations. It stays in the last pose.
     """
-    poses = (problem.get("truss") or problem.get("arm") or {}).get("base_motion") or ()
+    poses = arm_table(problem).get("base_motion") or ()
     found = np.zeros((len(times), 6))
     if not poses:
         return found

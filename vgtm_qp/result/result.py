@@ -321,7 +321,7 @@ def _links(chain: RecordedChain, q: Array) -> dict[str, NDArray[Any]]:
         raise ResultError(
             f"array joints holds {q.shape[1] - 6} joints; manifest.arm describes {len(chain.quantity_names)}"
         )
-    points = chain.placed(q)[0]
+    points = chain.nodes_at(q)
     return {
         "nodes": points,
         "members": chain.links,

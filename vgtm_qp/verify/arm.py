@@ -43,13 +43,15 @@ class RecordedArm:
         Home lengths and limits; inf without a limit.
     is_hull : (M,) bool
         All False.
+    revolute, followers : (M,) bool, (0, 2) int
+        All False and empty: no quantity is an angle, and none follows another.
     corners, offset : (M, 2, 3) int or (M, 2, 1) int, (M, 2, 3)
         Nodes that place the two ends of each member and orient its joints, and the ends in the joint frames,
         eqs. (12)-(13). For pin joints: the end's node alone, and zeros.
     """
 
     unit, body, rigid_body = "m", "member", "fixed member"
-    touching: Index = np.zeros((0, 2), dtype=np.int64)
+    touching = followers = np.zeros((0, 2), dtype=np.int64)
 
     def __init__(self, record: Mapping[str, Any], members: Index) -> None:
         count = len(members)
@@ -66,7 +68,8 @@ class RecordedArm:
         self.rate = table.numbers("rate", (count,), limits=True)
         self.acceleration = table.numbers("acceleration", (count,), limits=True)
         self.radius = table.numbers("radius", (count,))
-        self.is_hull, self.links = np.zeros(count, dtype=np.bool_), members
+        self.is_hull = self.revolute = np.zeros(count, dtype=np.bool_)
+        self.links = members
         tip = table.table("tip")
         self.tip = tip.integers("nodes", (None,), nodes)
         self.tip_weights = tip.numbers("weights", (len(self.tip),))
@@ -106,6 +109,18 @@ class RecordedArm:
     def has_pin_joints(self) -> bool:
         """True if members end in their nodes, and so move along straight lines when the nodes do."""
         return bool(self.corners.shape[2] == 1)
+
+    def nodes_at(self, nodes: Array) -> Array:
+        """Return the nodes (T, N, 3) themselves, m, which are a truss's configuration."""
+        return nodes
+
+    def frames(self, nodes: Array) -> list[tuple[Array, Array]]:  # noqa: ARG002
+        """Return no frames: members are not rigid bodies in them."""
+        return []
+
+    def of_values(self, lengths: Array) -> Array:
+        """Return (T, M) the quantities at lengths (T, M), which they are."""
+        return lengths
 
     def ends(self, nodes: Array) -> Array:
         """Return (..., M, 2, 3) the members' ends r_ik, eq. (13), m, at node positions (..., N, 3)."""
@@ -295,6 +310,7 @@ class RecordedArm:
 
 
 Arm = RecordedArm | RecordedChain
+"""What both have in common is all that those know who need not know the kind."""
 
 
 def recorded_arm(record: Mapping[str, Any], members: Index) -> Arm:

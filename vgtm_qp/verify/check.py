@@ -10,7 +10,7 @@ import numpy as np
 
 from vgtm_qp.arrays import Array
 from vgtm_qp.result.certificate import Certificate, Measure
-from vgtm_qp.result.poses import base_poses, rotations
+from vgtm_qp.result.poses import arm_table, base_poses, rotations
 from vgtm_qp.result.result import Result
 from vgtm_qp.verify.arm import Arm, arm_of
 from vgtm_qp.verify.clearance import RecordedMotion
@@ -173,7 +173,7 @@ def _difference(stored: Array, found: Array) -> Array:
 
 def locks_of(problem: Mapping[str, Any]) -> list[tuple[str, float]]:
     """Return name and time, s, of the actuators that a problem, as JSON data, locks."""
-    entries = (problem.get("truss") or problem.get("arm") or {}).get("locked") or ()
+    entries = arm_table(problem).get("locked") or ()
     tables = ({"member": entry} if isinstance(entry, str) else entry for entry in entries)
     return [(table.get("joint") or table["member"], float(table.get("time", 0.0))) for table in tables]
 

@@ -11,20 +11,20 @@ import numpy as np
 from vgtm_qp.arrays import Array
 from vgtm_qp.errors import VgtmError
 from vgtm_qp.problem.urdf import UrdfVisual, read_visuals
-from vgtm_qp.result.chain import RecordedChain
 from vgtm_qp.rotation import quaternion
+from vgtm_qp.verify.arm import Arm
 
 _SAME = 1e-9
 """Difference of joints, m or 1, up to which the URDF file is still that of the arm."""
 
 
-def link_surfaces(problem: Mapping[str, Any], arm: object, directory: Path) -> tuple[UrdfVisual, ...]:
+def link_surfaces(problem: Mapping[str, Any], arm: Arm, directory: Path) -> tuple[UrdfVisual, ...]:
     """Return what the URDF file of a problem draws of the arm's links.
 
     Nothing without such a file, and nothing where its joints are no longer those of the arm.
     """
     table = problem.get("arm") or {}
-    if not isinstance(arm, RecordedChain) or not table.get("urdf"):
+    if not table.get("urdf"):
         return ()
     file = directory / Path(table["urdf"]).expanduser()
     packages = [directory / Path(place).expanduser() for place in table.get("package_path") or ()]
@@ -46,7 +46,7 @@ def link_surfaces(problem: Mapping[str, Any], arm: object, directory: Path) -> t
 class LinkScene:
     """Surfaces of links in a viser scene, each in the frame of the joint that moves it."""
 
-    def __init__(self, scene: Any, arm: RecordedChain, surfaces: Sequence[UrdfVisual]) -> None:
+    def __init__(self, scene: Any, arm: Arm, surfaces: Sequence[UrdfVisual]) -> None:
         self._arm = arm
         self._frames = {
             k: scene.add_frame(f"/links/{k}", show_axes=False) for k in {s.joint for s in surfaces}
@@ -62,7 +62,7 @@ class LinkScene:
 
     def move(self, q: Array, resolution: float = 0.0) -> None:
         """Put the links where they are at a configuration (J + 6,); coordinates are rounded to a `resolution`."""
-        frames = self._arm.along(q[None])[2]
+        frames = self._arm.frames(q[None])
         for k, frame in self._frames.items():
             origin, attitude = frames[k]
             for key, value in (("position", origin[0]), ("wxyz", quaternion(attitude[0]))):

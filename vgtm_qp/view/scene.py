@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from vgtm_qp.arrays import Array
 from vgtm_qp.errors import MissingExtraError
-from vgtm_qp.result.chain import RecordedChain
 from vgtm_qp.rotation import quaternion
 from vgtm_qp.view.drawing import (
     CURVE_COLOUR,
@@ -119,8 +118,7 @@ class ArmScene:
         self._line: Any = None
         self._said: Any = None
         self._obstacles = {_path(mesh): self._add_obstacle(mesh) for mesh in drawing.obstacles}
-        surfaces = drawing.links()
-        if surfaces and isinstance(arm, RecordedChain):
+        if surfaces := drawing.links():
             self.links = LinkScene(self._scene, arm, surfaces)
             self.ball = min(self.ball, 0.3 * self.unit)
             self.show(links=True, bodies=False)
