@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -22,6 +23,7 @@ from vgtm_qp.rotation import rotation_from_vector, vector_from_rotation
 from vgtm_qp.step.chain_engine import ChainEngine
 from vgtm_qp.step.driver import Begun, Denied, Driver, Lost, Passage
 from vgtm_qp.step.path import Path
+from vgtm_qp.step.setup import Setup
 from vgtm_qp.study.scenes import random_scene
 from vgtm_qp.study.serial_scenes import random_serial_scene
 
@@ -33,19 +35,30 @@ SAME = 1e-10
 NAMES = [name for name, case in CASES.items() if case.load().method.name == "qp"]
 
 
+def answers_of(patch: pytest.MonkeyPatch, of: Callable[[object], Any]) -> list[Any]:
+    """What the answer of each step that is offered in one call is, from now on."""
+    assert building().finish() is not None
+    found, take = list[Any](), Driver.take
+
+    def kept(self, *asked):
+        taken = take(self, *asked)
+        found.append(of(taken))
+        return taken
+
+    patch.setattr(Driver, "take", kept)
+    return found
+
+
 @pytest.fixture
 def driven(monkeypatch) -> list[bool]:
     """Whether each of the steps that was offered so far was taken in one call."""
-    assert building().finish() is not None
-    found, take = list[bool](), Driver.take
+    return answers_of(monkeypatch, lambda answer: isinstance(answer, Passage))
 
-    def counted(self, *asked):
-        taken = take(self, *asked)
-        found.append(isinstance(taken, Passage))
-        return taken
 
-    monkeypatch.setattr(Driver, "take", counted)
-    return found
+@pytest.fixture
+def answers(monkeypatch) -> list[object]:
+    """The answer of each of the steps that was offered so far."""
+    return answers_of(monkeypatch, lambda answer: answer)
 
 
 def without(problem: vq.Problem) -> vq.Resolver:
@@ -131,11 +144,80 @@ def test_it_takes_the_steps_of_an_attempt_beside_a_cylinder(driven):
     assert any(driven)
 
 
-@pytest.mark.parametrize("name", ["snake_past_a_cube", "twelve_joints_past_a_crate"])
-def test_it_takes_the_steps_of_serial_arms(name, driven, rng):
-    problem = vq.load_problem(name)
-    compare(problem, rng, 10, SAME)
+def as_it_is(problem: vq.Problem, rng: np.random.Generator) -> vq.Problem:
+    return problem
+
+
+def on_a_curve_with_torsion(problem: vq.Problem, rng: np.random.Generator) -> vq.Problem:
+    return problem.replace({"curve.torsion_vertices": 1, "curve.nodes": "arc-length"})
+
+
+def on_a_moving_base(problem: vq.Problem, rng: np.random.Generator) -> vq.Problem:
+    """The problem on a base that moves and turns, and then rests."""
+    setup, table = vq.Resolver(problem).setup, "arm" if problem.truss is None else "truss"
+    poses = [
+        {
+            "time": steps * setup.dt,
+            "position": (0.02 * setup.arm.unit * rng.normal(size=3)).tolist(),
+            "rotation_vector": (0.02 * rng.normal(size=3)).tolist(),
+        }
+        for steps in (2.5, 6.0)
+    ]
+    return problem.replace({f"{table}.base_motion": poses})
+
+
+def among_moving_obstacles(problem: vq.Problem, rng: np.random.Generator) -> vq.Problem:
+    """The problem with obstacles that move, each on its own way."""
+    setup = vq.Resolver(problem).setup
+    size = 0.03 * setup.arm.unit / setup.dt
+    moving = [
+        {**table, "velocity": (size * rng.normal(size=3)).tolist()} for table in problem.to_dict()["obstacle"]
+    ]
+    return problem.replace({"obstacle": moving})
+
+
+def among_these_on_a_moving_base(problem: vq.Problem, rng: np.random.Generator) -> vq.Problem:
+    return on_a_moving_base(among_moving_obstacles(problem, rng), rng)
+
+
+BUNDLED = {
+    as_it_is: ["snake_past_a_cube", "twelve_joints_past_a_crate"],
+    on_a_curve_with_torsion: ["snake_past_a_cube"],
+    on_a_moving_base: [
+        "five_bay_two_cubes",
+        "snake_past_a_cube",
+        "twelve_joints_past_a_crate",
+        "hexapod_past_a_cube",
+        "beta_spline_past_a_cube",
+    ],
+    among_moving_obstacles: ["five_bay_two_cubes", "snake_past_a_cube", "twelve_joints_past_a_crate"],
+}
+"""Names of problems, by how they are changed."""
+
+
+@pytest.mark.parametrize(
+    ("change", "name"), [(change, name) for change, names in BUNDLED.items() for name in names]
+)
+def test_it_takes_the_steps_of_bundled_problems(change, name, driven, rng):
+    compare(change(vq.load_problem(name), rng), rng, 10, SAME)
     assert any(driven)
+
+
+@pytest.mark.parametrize("number", range(12))
+@pytest.mark.parametrize(
+    ("change", "of_serial_arms"),
+    [
+        (as_it_is, as_it_is),
+        (on_a_moving_base, on_a_moving_base),
+        (among_moving_obstacles, among_these_on_a_moving_base),
+    ],
+)
+def test_it_takes_the_steps_of_random_arms(change, of_serial_arms, number, driven, rng):
+    seed = int(rng.integers(2**31))
+    compare(change(random_scene(seed, number, steps=10).problem, rng), rng, 8, SAME)
+    serial = random_serial_scene(seed, number, steps=10)
+    if serial.arm_table.bodies != "hull":
+        compare(of_serial_arms(serial, rng), rng, 8, SAME)
 
 
 POSE = ["position", "pointing", "orientation"]
@@ -177,14 +259,6 @@ def test_it_takes_the_steps_on_curves_that_tables_do_not_describe(
     assert vq.Resolver(problem).setup.layout.general is not None
     driven.clear()
     compare(problem, rng, 10, (100.0 if solver == "piqp" else 1.0) * SAME)
-    assert any(driven)
-
-
-def test_it_takes_the_steps_of_a_serial_arm_on_a_curve_with_torsion(driven, rng):
-    problem = vq.load_problem("snake_past_a_cube").replace(
-        {"curve.torsion_vertices": 1, "curve.nodes": "arc-length"}
-    )
-    compare(problem, rng, 10, SAME)
     assert any(driven)
 
 
@@ -262,15 +336,6 @@ def test_it_takes_the_steps_of_long_arms_among_obstacles(module, mode, asked, di
     assert any(driven)
 
 
-@pytest.mark.parametrize("number", range(12))
-def test_it_takes_the_steps_of_random_arms(number, driven, rng):
-    seed = int(rng.integers(2**31))
-    compare(random_scene(seed, number, steps=10).problem, rng, 8, SAME)
-    serial = random_serial_scene(seed, number, steps=10)
-    if serial.arm_table.bodies != "hull":
-        compare(serial, rng, 8, SAME)
-
-
 def problem_of_two_qps(name: str, **changes: object) -> vq.Problem:
     """A problem in which steps towards far goals need further QPs; contacts by closed forms, which are exact."""
     problem = CASES[name].load() if name in CASES else vq.load_problem(name)
@@ -346,33 +411,18 @@ def test_further_qps_are_those_of_an_attempt(name, driven, monkeypatch, rng):
     assert np.mean(np.array(apart) < SAME) > 0.8
 
 
-def on_a_moving_base(problem: vq.Problem, rng: np.random.Generator) -> vq.Problem:
-    """The problem on a base that moves and turns, and then rests."""
-    setup, table = vq.Resolver(problem).setup, "arm" if problem.truss is None else "truss"
-    poses = [
-        {
-            "time": steps * setup.dt,
-            "position": (0.02 * setup.arm.unit * rng.normal(size=3)).tolist(),
-            "rotation_vector": (0.02 * rng.normal(size=3)).tolist(),
-        }
-        for steps in (2.5, 6.0)
-    ]
-    return problem.replace({f"{table}.base_motion": poses})
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        "five_bay_two_cubes",
-        "snake_past_a_cube",
-        "twelve_joints_past_a_crate",
-        "hexapod_past_a_cube",
-        "beta_spline_past_a_cube",
-    ],
-)
-def test_it_takes_the_steps_of_arms_on_moving_bases(name, driven, rng):
-    compare(on_a_moving_base(vq.load_problem(name), rng), rng, 10, SAME)
-    assert any(driven)
+def ball_beside(setup: Setup, body: int) -> tuple[dict[str, object], np.ndarray]:
+    """A ball that is 5 mm from the clearance of a body at home, and the direction from the body to it."""
+    ends = setup.arm.bodies.some(setup.arm.home)[body]
+    middle, aside = ends.mean(axis=0), np.cross(ends[1] - ends[0], [0.0, -1.0, 0.0])
+    aside *= np.copysign(1.0 / np.linalg.norm(aside), middle[0] * aside[0])
+    way = setup.arm.bodies.radius[body] + setup.safe + 0.005 + 0.1
+    return {
+        "name": "ball",
+        "shape": "sphere",
+        "radius": 0.1,
+        "center": (middle + way * aside).tolist(),
+    }, aside
 
 
 @pytest.mark.parametrize(
@@ -381,11 +431,7 @@ def test_it_takes_the_steps_of_arms_on_moving_bases(name, driven, rng):
 def test_a_body_that_the_base_pushes_onto_a_ball_gives_way(name, body, driven):
     problem = vq.load_problem(name)
     setup, table = vq.Resolver(problem).setup, "arm" if problem.truss is None else "truss"
-    ends = setup.arm.bodies.some(setup.arm.home)[body]
-    middle, aside = ends.mean(axis=0), np.cross(ends[1] - ends[0], [0.0, -1.0, 0.0])
-    aside *= np.copysign(1.0 / np.linalg.norm(aside), middle[0] * aside[0])
-    way = setup.arm.bodies.radius[body] + setup.safe + 0.005 + 0.1
-    ball = {"name": "ball", "shape": "sphere", "center": (middle + way * aside).tolist(), "radius": 0.1}
+    ball, aside = ball_beside(setup, body)
     motion = [{"time": 20 * setup.dt, "position": (0.04 * aside).tolist()}]
     problem = problem.replace({"obstacle": [ball], f"{table}.base_motion": motion})
     one, other = vq.Resolver(problem), without(problem)
@@ -407,50 +453,12 @@ def test_a_body_that_the_base_pushes_onto_a_ball_gives_way(name, body, driven):
     assert all(driven)
 
 
-@pytest.mark.parametrize("number", range(12))
-def test_it_takes_the_steps_of_random_arms_on_moving_bases(number, driven, rng):
-    seed = int(rng.integers(2**31))
-    compare(on_a_moving_base(random_scene(seed, number, steps=10).problem, rng), rng, 8, SAME)
-    serial = random_serial_scene(seed, number, steps=10)
-    if serial.arm_table.bodies != "hull":
-        compare(on_a_moving_base(serial, rng), rng, 8, SAME)
-
-
-def among_moving_obstacles(problem: vq.Problem, rng: np.random.Generator) -> vq.Problem:
-    """The problem with obstacles that move, each on its own way."""
-    setup = vq.Resolver(problem).setup
-    size = 0.03 * setup.arm.unit / setup.dt
-    moving = [
-        {**table, "velocity": (size * rng.normal(size=3)).tolist()} for table in problem.to_dict()["obstacle"]
-    ]
-    return problem.replace({"obstacle": moving})
-
-
-@pytest.mark.parametrize("name", ["five_bay_two_cubes", "snake_past_a_cube", "twelve_joints_past_a_crate"])
-def test_it_takes_the_steps_of_arms_among_moving_obstacles(name, driven, rng):
-    compare(among_moving_obstacles(vq.load_problem(name), rng), rng, 10, SAME)
-    assert any(driven)
-
-
-@pytest.mark.parametrize("number", range(12))
-def test_it_takes_the_steps_of_random_arms_among_moving_obstacles(number, driven, rng):
-    seed = int(rng.integers(2**31))
-    compare(among_moving_obstacles(random_scene(seed, number, steps=10).problem, rng), rng, 8, SAME)
-    serial = random_serial_scene(seed, number, steps=10)
-    if serial.arm_table.bodies != "hull":
-        compare(on_a_moving_base(among_moving_obstacles(serial, rng), rng), rng, 8, SAME)
-
-
 @pytest.mark.parametrize("name", ["five_bay_free", "snake_past_a_cube", "twelve_joints_past_a_crate"])
 @pytest.mark.parametrize("distance", ["fcl", "exact"])
 def test_an_arm_gives_way_to_a_ball_that_pushes_it(name, distance, driven):
     problem = vq.load_problem(name).replace({"clearance.distance": distance})
     setup = vq.Resolver(problem).setup
-    ends = setup.arm.bodies.some(setup.arm.home)[len(setup.arm.bodies) // 2]
-    middle, aside = ends.mean(axis=0), np.cross(ends[1] - ends[0], [0.0, -1.0, 0.0])
-    aside *= np.copysign(1.0 / np.linalg.norm(aside), middle[0] * aside[0])
-    way = setup.arm.bodies.radius[0] + setup.safe + 0.005 + 0.1
-    ball = {"name": "ball", "shape": "sphere", "radius": 0.1, "center": (middle + way * aside).tolist()}
+    ball, aside = ball_beside(setup, len(setup.arm.bodies) // 2)
     ball["velocity"] = (-0.01 * setup.arm.unit / setup.dt * aside).tolist()
     problem = problem.replace({"obstacle": [ball]})
     one, other = vq.Resolver(problem), without(problem)
@@ -504,39 +512,23 @@ def test_most_steps_are_usual(name, velocity, driven):
     assert np.mean(driven) > 0.9
 
 
-def test_most_steps_of_further_qps_are_taken_by_calls(monkeypatch):
-    assert building().finish() is not None
-    found, take = [], Driver.take
-
-    def kept(self, *asked):
-        found.append(take(self, *asked))
-        return found[-1]
-
-    monkeypatch.setattr(Driver, "take", kept)
+def test_most_steps_of_further_qps_are_taken_by_calls(answers):
     vq.solve(vq.load_problem("five_bay_two_cubes_pointing"))
     further = [
-        one for one in found if isinstance(one, Begun | Lost) or (isinstance(one, Passage) and one.qps > 1)
+        one for one in answers if isinstance(one, Begun | Lost) or (isinstance(one, Passage) and one.qps > 1)
     ]
     assert sum(isinstance(one, Passage) and one.qps == 2 for one in further) >= 10
     assert np.mean([isinstance(one, Begun) for one in further]) < 0.1
 
 
 @pytest.mark.parametrize("name", ["octahedral", "offset joints"])
-def test_a_qp_of_which_a_call_says_so_has_no_answer(name, monkeypatch):
-    assert building().finish() is not None
-    found, take = [], Driver.take
-
-    def kept(self, *asked):
-        found.append(take(self, *asked))
-        return found[-1]
-
-    monkeypatch.setattr(Driver, "take", kept)
+def test_a_qp_of_which_a_call_says_so_has_no_answer(name, answers):
     resolver = vq.Resolver(problem_of_two_qps(FURTHER[name][0]))
     # Far out and against the cubes stations cannot stay on the curve.
     ways = np.random.default_rng(1).normal(size=(4, 3))
     for way in np.repeat(ways / np.linalg.norm(ways, axis=1, keepdims=True), 15, axis=0):
         resolver.step(position=resolver.tip()[0] + 0.05 * way)
-    denied = [one for one in found if isinstance(one, Denied)]
+    denied = [one for one in answers if isinstance(one, Denied)]
     assert len(denied) > 3
     for one in denied[:: len(denied) // 3]:
         with pytest.raises((InfeasibleStepError, AssertionError)):
