@@ -17,6 +17,7 @@ from vgtm_qp.curve.families import bezier
 from vgtm_qp.problem import Problem
 from vgtm_qp.problem.method import Weights
 from vgtm_qp.qp.layout import Layout
+from vgtm_qp.qp.shape import CurveRows, CurveShape
 from vgtm_qp.step.task import TipTask
 
 Array = NDArray[np.float64]
@@ -106,6 +107,34 @@ def central_differences(function: Callable[[Array], Any], X: Array, h: float = 1
         ahead, behind = (function(X + sign * step.reshape(X.shape)) for sign in (1.0, -1.0))
         columns.append((np.asarray(ahead) - np.asarray(behind)) / (2 * h))
     return np.stack(columns, axis=-1).reshape(*np.shape(columns[0]), *X.shape)
+
+
+def check_curve_rows(
+    shape: CurveShape,
+    vertices: Array,
+    torsion: Array,
+    base: Array,
+    *,
+    atol: float,
+    turn_atol: float,
+    first: int = 0,
+) -> None:
+    """The rows of a curve are the derivatives of its nodes, spacings and frames; of these from a coordinate on."""
+    coordinates = np.concatenate([vertices.reshape(-1), torsion])
+
+    def at(z: Array) -> CurveRows:
+        return shape.rows(z[: vertices.size].reshape(-1, 3), z[vertices.size :], base)
+
+    rows = at(coordinates)
+    for value, row in (("position", rows.position_rows), ("spacing", rows.spacing_rows)):
+        wanted = central_differences(lambda z, name=value: getattr(at(z), name), coordinates)
+        np.testing.assert_allclose(row, wanted, atol=atol)
+    change = central_differences(lambda z: at(z).frame, coordinates)
+    turning = np.cross(np.swapaxes(rows.spin_rows, 1, 2)[:, None], rows.frame.transpose(0, 2, 1)[:, :, None])
+    if not shape.tracks_roll:
+        change, turning = change[:, :, 2:], turning[:, 2:]
+    found = turning.transpose(0, 3, 1, 2)
+    np.testing.assert_allclose(found[..., first:], change[..., first:], atol=turn_atol)
 
 
 def arm_problem(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from arms import central_differences
+from arms import check_curve_rows
 
 from vgtm_qp.builder import source_of
 from vgtm_qp.compiled import compiler
@@ -93,21 +93,7 @@ def test_they_give_what_the_curve_itself_gives(shape, rng):
 
 @pytest.mark.parametrize("shape", shapes())
 def test_the_rows_are_the_derivatives_of_nodes_frames_and_spacings(shape, rng):
-    vertices, torsion, base = bent(shape, rng, 0.03)
-    coordinates = np.concatenate([vertices.reshape(-1), torsion])
-
-    def at(z):
-        return shape.rows(z[: vertices.size].reshape(-1, 3), z[vertices.size :], base)
-
-    rows = at(coordinates)
-    for value, row in (("position", rows.position_rows), ("spacing", rows.spacing_rows)):
-        wanted = central_differences(lambda z, name=value: getattr(at(z), name), coordinates)
-        np.testing.assert_allclose(row, wanted, atol=1e-6)
-    change = central_differences(lambda z: at(z).frame, coordinates)
-    turning = np.cross(np.swapaxes(rows.spin_rows, 1, 2)[:, None], rows.frame.transpose(0, 2, 1)[:, :, None])
-    if not shape.tracks_roll:
-        change, turning = change[:, :, 2:], turning[:, 2:]
-    np.testing.assert_allclose(turning.transpose(0, 3, 1, 2), change, atol=1e-5)
+    check_curve_rows(shape, *bent(shape, rng, 0.03), atol=1e-6, turn_atol=1e-5)
 
 
 @pytest.mark.parametrize("name", OPTIONS)

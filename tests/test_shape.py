@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import oracle
 import pytest
-from arms import arm_problem, central_differences
+from arms import arm_problem, check_curve_rows
 from scipy.spatial.transform import Rotation
 
 import vgtm_qp as vq
@@ -177,24 +177,9 @@ def test_the_rows_of_a_curve_are_the_derivatives_of_its_nodes_frames_and_spacing
     setup = built(module, bays, curve, method)
     shape, arm = setup.layout.shape, setup.arm
     _, _, vertices, torsion = near_home(setup, rng)
-    base = arm.stations.frames[0]
     # The frame is carried along from the base face: it stays where the curve leaves that along its normal.
     vertices[1] = vertices[0] + [0.0, 0.0, 0.4]
-    coordinates = np.concatenate([vertices.reshape(-1), torsion])
-
-    def at(z):
-        return shape.rows(z[: vertices.size].reshape(-1, 3), z[vertices.size :], base)
-
-    rows = at(coordinates)
-    for value, row in (("position", rows.position_rows), ("spacing", rows.spacing_rows)):
-        wanted = central_differences(lambda z, name=value: getattr(at(z), name), coordinates)
-        np.testing.assert_allclose(row, wanted, atol=1e-7)
-    change = central_differences(lambda z: at(z).frame, coordinates)
-    turning = np.cross(np.swapaxes(rows.spin_rows, 1, 2)[:, None], rows.frame.transpose(0, 2, 1)[:, :, None])
-    if not shape.tracks_roll:
-        change, turning = change[:, :, 2:], turning[:, 2:]
-    free = np.r_[5 : len(coordinates)]
-    np.testing.assert_allclose(turning.transpose(0, 3, 1, 2)[..., free], change[..., free], atol=1e-7)
+    check_curve_rows(shape, vertices, torsion, arm.stations.frames[0], atol=1e-7, turn_atol=1e-7, first=5)
 
 
 @pytest.mark.parametrize(("module", "bays", "curve", "method"), GENERAL[3:5], ids=str)
