@@ -82,7 +82,27 @@ class JointScene(NamedTuple):
         return cls(setup, arm, links, pairs, problem)
 
 
-class MinkStep:
+class _JointStep:
+    """A peer whose joint values are in a configuration of its own package."""
+
+    _configuration: Any
+
+    @property
+    def reached(self) -> Array:
+        """Joint values (J,) after the step, rad."""
+        return np.array(self._configuration.q)
+
+    @property
+    def configuration(self) -> Array:
+        """See :class:`~vgtm_qp.bench.between.Walker`."""
+        return np.append(self.reached, np.zeros(6))
+
+    def place(self, state: State) -> None:
+        """See :class:`~vgtm_qp.bench.contestants.Contestant`."""
+        self._configuration.update(state.quantities)
+
+
+class MinkStep(_JointStep):
     """Steps by mink 1.x: frame and posture task, limits of joints, speeds and collisions, solved by DAQP."""
 
     def __init__(self, problem: Problem) -> None:
@@ -115,23 +135,9 @@ class MinkStep:
             self._limits.append(limit)
 
     @property
-    def reached(self) -> Array:
-        """Joint values (J,) after the step, rad."""
-        return np.array(self._configuration.q)
-
-    @property
-    def configuration(self) -> Array:
-        """See :class:`~vgtm_qp.bench.between.Walker`."""
-        return np.append(self.reached, np.zeros(6))
-
-    @property
     def tip(self) -> Array:
         """(3,) Position of the tip by the peer's own kinematics, m."""
         return np.array(self._configuration.get_transform_frame_to_world("tip", "site").translation())
-
-    def place(self, state: State) -> None:
-        """See :class:`~vgtm_qp.bench.contestants.Contestant`."""
-        self._configuration.update(state.quantities)
 
     def step(self, goal: Goal) -> bool:
         """See :class:`~vgtm_qp.bench.contestants.Contestant`."""
@@ -147,7 +153,7 @@ class MinkStep:
         return True
 
 
-class PinkStep:
+class PinkStep(_JointStep):
     """Steps by pink 4.x: frame and posture task, limits of joints and speeds, a barrier of distances, by DAQP."""
 
     def __init__(self, problem: Problem) -> None:
@@ -172,23 +178,9 @@ class PinkStep:
             self._barriers.append(barrier)
 
     @property
-    def reached(self) -> Array:
-        """Joint values (J,) after the step, rad."""
-        return np.array(self._configuration.q)
-
-    @property
-    def configuration(self) -> Array:
-        """See :class:`~vgtm_qp.bench.between.Walker`."""
-        return np.append(self.reached, np.zeros(6))
-
-    @property
     def tip(self) -> Array:
         """(3,) Position of the tip by the peer's own kinematics, m."""
         return np.array(self._configuration.get_transform_frame_to_world("tip").translation)
-
-    def place(self, state: State) -> None:
-        """See :class:`~vgtm_qp.bench.contestants.Contestant`."""
-        self._configuration.update(state.quantities)
 
     def step(self, goal: Goal) -> bool:
         """See :class:`~vgtm_qp.bench.contestants.Contestant`."""
