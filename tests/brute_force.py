@@ -1,11 +1,39 @@
-"""The distance of every pair of a monitor, one by one."""
+"""Monitors of random scenes, and the distance of every pair of a monitor, one by one."""
 
 import numpy as np
 from geometry_reference import segment_distance
+from scipy.spatial.transform import Rotation
 
+from vgtm_qp.geometry.bodies import capsules
+from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.geometry.groups import Group
+from vgtm_qp.geometry.shapes import box, cylinder, mesh, sphere
 
 SHIFT = {"box": [0], "sphere": [0], "cylinder": [0], "triangle": [0, 3, 6]}
+
+MEMBERS = [(0, 1), (1, 2), (2, 3), (3, 4), (4, 5), (0, 2), (1, 4)]
+
+
+def random_clearance(rng, velocity, *, meshes=(), round_numbers=False):
+    """Six nodes, and a monitor of their members among a box, a ball, a post and meshes, each with a `velocity()`."""
+
+    def vector(bound):
+        v = rng.uniform(-bound, bound, 3)
+        return np.round(4.0 * v) / 4.0 if round_numbers else v
+
+    def turn():
+        return (
+            np.eye(3) if round_numbers else Rotation.random(random_state=int(rng.integers(2**31))).as_matrix()
+        )
+
+    obstacles = [
+        box("box", vector(2.0), rng.choice([0.25, 0.5, 0.75], 3), turn(), velocity()),
+        sphere("ball", vector(2.0), 0.25, velocity()),
+        cylinder("post", vector(2.0), 0.25, 1.0, turn(), velocity()),
+        *(mesh("wedge", surface, vector(2.0), turn(), 0.5, velocity()) for surface in meshes),
+    ]
+    nodes = np.array([vector(1.5) for _ in range(6)])
+    return nodes, Clearance(capsules(MEMBERS, 0.03), obstacles, safe=0.08, influence=0.5)
 
 
 def piece_at(clearance, piece, time):

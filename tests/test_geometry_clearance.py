@@ -2,11 +2,10 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from brute_force import brute_force, piece_at
+from brute_force import brute_force, piece_at, random_clearance
 from geometry_reference import octahedral_arm, segment_distance
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
 
 from vgtm_qp.geometry.bodies import capsules
 from vgtm_qp.geometry.candidates import Candidates
@@ -16,28 +15,10 @@ from vgtm_qp.geometry.shapes import GeometryError, box, cylinder, mesh, sphere
 TETRAHEDRON = ([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
 
 
-def random_scene(rng, *, still=False, round_numbers=False):
-    def vector(bound):
-        v = rng.uniform(-bound, bound, 3)
-        return np.round(4.0 * v) / 4.0 if round_numbers else v
-
-    def turn():
-        return (
-            np.eye(3) if round_numbers else Rotation.random(random_state=int(rng.integers(2**31))).as_matrix()
-        )
-
-    def speed():
-        return np.zeros(3) if still else rng.normal(size=3) * 0.3
-
-    nodes = np.array([vector(1.5) for _ in range(6)])
-    members = [(0, 1), (1, 2), (2, 3), (3, 4), (4, 5), (0, 2), (1, 4)]
-    obstacles = [
-        box("box", vector(2.0), rng.choice([0.25, 0.5, 0.75], 3), turn(), speed()),
-        sphere("ball", vector(2.0), 0.25, speed()),
-        cylinder("post", vector(2.0), 0.25, 1.0, turn(), speed()),
-        mesh("wedge", TETRAHEDRON, vector(2.0), turn(), 0.5, speed()),
-    ]
-    return nodes, Clearance(capsules(members, 0.03), obstacles, safe=0.08, influence=0.5)
+def random_scene(rng, *, round_numbers=False):
+    return random_clearance(
+        rng, lambda: 0.3 * rng.normal(size=3), meshes=[TETRAHEDRON], round_numbers=round_numbers
+    )
 
 
 @settings(max_examples=12, deadline=None)

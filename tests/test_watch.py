@@ -4,46 +4,28 @@ import casadi as ca
 import numpy as np
 import pytest
 from arms import TRUSSES
-from brute_force import brute_force, every_pair
-from scipy.spatial.transform import Rotation
+from brute_force import MEMBERS, brute_force, every_pair, random_clearance
 
 from vgtm_qp.arm.truss.arm import TrussArm
 from vgtm_qp.compiled import Kernel, compiler
 from vgtm_qp.geometry.bodies import capsules
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.geometry.pairs import Pair
-from vgtm_qp.geometry.shapes import GeometryError, box, cylinder, mesh, sphere
+from vgtm_qp.geometry.shapes import GeometryError, box, mesh, sphere
 from vgtm_qp.geometry.watch import Watch
 from vgtm_qp.native import Code, Program, building
-
-MEMBERS = [(0, 1), (1, 2), (2, 3), (3, 4), (4, 5), (0, 2), (1, 4)]
 
 FORWARD = np.array([1.0, 0.0, 0.0])
 
 
-def scene(rng, *, round_numbers=False, watch=True, fastest=0.0):
+def scene(rng, *, fastest=0.0, round_numbers=False):
     """Nodes, and a monitor of their members among a box, a ball and a post, whose speeds are up to `fastest`."""
-
-    def vector(bound):
-        v = rng.uniform(-bound, bound, 3)
-        return np.round(4.0 * v) / 4.0 if round_numbers else v
-
-    def turn():
-        return (
-            np.eye(3) if round_numbers else Rotation.random(random_state=int(rng.integers(2**31))).as_matrix()
-        )
 
     def velocity():
         way = rng.normal(size=3)
         return rng.uniform(0.0, fastest) * way / np.linalg.norm(way) if fastest else np.zeros(3)
 
-    obstacles = [
-        box("box", vector(2.0), rng.choice([0.25, 0.5, 0.75], 3), turn(), velocity()),
-        sphere("ball", vector(2.0), 0.25, velocity()),
-        cylinder("post", vector(2.0), 0.25, 1.0, turn(), velocity()),
-    ]
-    nodes = np.array([vector(1.5) for _ in range(6)])
-    return nodes, Clearance(capsules(MEMBERS, 0.03), obstacles, safe=0.08, influence=0.5, watch=watch)
+    return random_clearance(rng, velocity, round_numbers=round_numbers)
 
 
 def watch_of(monitor):
