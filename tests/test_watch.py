@@ -191,6 +191,28 @@ def test_contacts_are_the_same_whichever_way_they_are_found(fastest, rng):
     assert compared > 20
 
 
+@pytest.mark.skipif(compiler() is None, reason="no C compiler")
+def test_pieces_that_are_gone_are_forgotten_with_their_pairs(rng):
+    """Many balls, then few and none; the way goes on before anything is listed anew."""
+    assert building().finish() is not None
+    X, watched = scene(rng)
+    place, compared = X, 0
+    for count in (60, 2, 30, 0, 1, 20):
+        balls = [
+            sphere(f"ball {k}", rng.uniform(-2.0, 2.0, 3), 0.1, 0.1 * rng.normal(size=3))
+            for k in range(count)
+        ]
+        watched.put(balls)
+        listed = Clearance(capsules(MEMBERS, 0.03), balls, safe=0.08, influence=0.5, watch=False)
+        for k, state in enumerate(walk(place, rng, 4, 0.05)[1:]):
+            assert watched.watching() is not None
+            watched.along(np.stack([place, state]), 0.1 * k, 0.1 * (k + 1), -1.0, -1.0, thorough=False)
+            place = state
+            if not min(distance for distance in brute_force(watched, state, 0.1 * (k + 1)).values()) <= 0.0:
+                compared += compare(watched, listed, state, time=0.1 * (k + 1), self_reach=0.3)
+    assert compared > 10
+
+
 @pytest.mark.parametrize("name", ["octahedral", "longeron", "graph"])
 def test_members_that_end_in_offset_joints_are_watched_too(name, rng):
     arm = TrussArm(TRUSSES[name](joint_offset=0.1))

@@ -112,6 +112,11 @@ class ListedPairs:
             contacts=self._contacts,
         )
 
+    def forget_pieces(self) -> None:
+        """Forget the pairs with pieces."""
+        if not self.is_self:
+            self.data.count = self.data.near = self.data.overlaps = 0
+
     def make_room(self) -> bool:
         """Make more room if there is none left; return whether there was none."""
         is_full = bool(self.data.count == self.data.room)
@@ -164,6 +169,8 @@ class Watch:
     def forget_pieces(self) -> None:
         """Forget the pairs with pieces, because the pieces are others now; pairs of bodies are kept."""
         self._put()
+        for pairs in self._pairs.values():
+            pairs.forget_pieces()
         if self._way is not None:
             self._way.set(**self._of_pieces())
 
