@@ -66,10 +66,11 @@ _PRELUDE = """#include <math.h>
 
 
 def source_of(function: ca.Function) -> str:
-    """Return the C code of a function."""
+    """Return the C code of a function, whose arguments must all be given."""
     generator = ca.CodeGenerator(f"{function.name()}.c", {"with_header": False})
     generator.add(function)
-    return str(generator.dump())
+    # CasADi looks at each use of an argument whether it is missing, and keeps zeros for it.
+    return re.sub(r"(arg\[\d+\]) ?\? (\1(?:\[\d+\])?) : \w+;", r"\2;", str(generator.dump()))
 
 
 def split(source: str) -> tuple[str, dict[str, str]]:

@@ -70,7 +70,7 @@ OWN = ("-O3", "-fno-signed-zeros", "-fassociative-math")
 HUNG, WRONG = 3, 4
 """Exit codes of a builder whose compiler hung, or made code of other values than its function's."""
 
-_FORM = "1"
+_FORM = "2"
 """Version of the libraries that builders make: with another number all of them are made anew."""
 
 OFTEN, SELDOM = 8, 600
