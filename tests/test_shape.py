@@ -19,9 +19,9 @@ from vgtm_qp.errors import CurveError, GoalError, ProblemError
 from vgtm_qp.methods import Resolver
 from vgtm_qp.qp.linearise import Linearisation
 from vgtm_qp.qp.numbers import ClearanceRows
+from vgtm_qp.step.arrival import Arrival
 from vgtm_qp.step.build import build_arm
 from vgtm_qp.step.checks import find_warnings
-from vgtm_qp.step.gap import Gap
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.step import StepStatus
 from vgtm_qp.step.target import QPInput, Target
@@ -193,7 +193,7 @@ def test_tracking_errors_are_the_greatest_gap_or_turn(module, bays, curve, metho
         if each.general is None:
             frames, points = None, each.curve_weights @ vertices
         wanted = oracle.tracking_error(each, X, vertices, frames, points)
-        found = Gap(each, setup.kinematics).greatest(X, vertices, torsion, None)
+        found = Arrival(each).gap(X, vertices, torsion, None)
         assert found == pytest.approx(wanted, abs=1e-13)
         assert found > 0.01
 

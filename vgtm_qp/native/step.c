@@ -33,11 +33,10 @@ typedef struct {
     int turns;                             /* coordinates of the tip's turn that are tracked: 0, 2 for its z-axis, or 3 */
     double unit;                           /* of the arm, m: by which angles become lengths */
 
-    /* Whether the curve ends at the tip, and along its z-axis, and whether stations must be on it; the gain (V, 1 or 2)
-       from the errors of place and slope at its end; the base's normal (3). */
-    int ends_at_tip, ends_along_tip, must_track;
-    int slides;                            /* whether the places on the curve are not where constant tables have them */
-    const double *end_gain, *base_normal;
+    /* The curve of the next state from where it was settled, see ending_function and gap_function; between them, where
+       constant tables do not give these, the nodes of that curve. Without eval if there is none. */
+    Kernel ending, curve_nodes, gaps;
+    int must_track;                        /* whether stations must be on the curve */
 
     /* Clearances, the margin of their rows, the distance of pairs that are far, share and least of a pair's approach;
        rounding of a distance. */
@@ -398,76 +397,16 @@ static int is_flawless(StepData *s)
     return sqrt(beyond) <= s->member + rounding && sqrt(wrong) <= s->member + rounding && sqrt(off) <= s->tip + rounding;
 }
 
-/* The curve's end, which linear rows leave a small way from the tip, is moved there; see Layout.ended. */
-static void end_curve(StepData *s)
+/* The curve of the next state, whose end linear rows leave a small way from the tip, and the gaps of its stations. */
+static int end_curve(StepData *s)
 {
-    const Fused *f = s->fused;
-    const double *position = f->missing.res[1], *axis = f->missing.res[2] + 6, *points = f->points;
-    int errors = 1 + s->ends_along_tip;
-    double missing[6], slope[3] = {0.0, 0.0, 0.0};
-    memcpy(s->next_vertices, points, sizeof(double) * 3 * f->vertices);
-    if (!s->ends_at_tip) return;
-    memcpy(missing, position, sizeof(double) * 3);
-    const double *weight = f->curve_weight + (f->stations - 1) * f->vertices;
-    const double *slopes = f->curve_slope + (f->stations - 1) * f->vertices;
-    for (int v = 0; v < f->vertices; v++)
-        for (int a = 0; a < 3; a++) {
-            missing[a] -= weight[v] * points[3 * v + a];
-            slope[a] += slopes[v] * points[3 * v + a];
-        }
-    double along = copysign(norm(slope, 3), dot(slope, axis, 3));
-    for (int a = 0; a < 3; a++) missing[3 + a] = along * axis[a] - slope[a];
-    for (int v = 0; v < f->vertices; v++)
-        for (int a = 0; a < 3; a++)
-            for (int e = 0; e < errors; e++) s->next_vertices[3 * v + a] += s->end_gain[errors * v + e] * missing[3 * e + a];
-}
-
-/* Whether the curve begins against the base's normal, or ends against the tip's. */
-static int reverses(const StepData *s)
-{
-    const Fused *f = s->fused;
-    const double *v = s->next_vertices, *end = v + 3 * (f->vertices - 2), *axis = f->missing.res[2] + 6;
-    if (!f->legs) return 0;
-    double first = 0.0, last = 0.0;
-    for (int a = 0; a < 3; a++) {
-        first += (v[3 + a] - v[a]) * s->base_normal[a];
-        last += (end[3 + a] - end[a]) * axis[a];
-    }
-    return first < 0.0 || (s->ends_along_tip && last < 0.0);
-}
-
-/* Find the places of the stations on the next curve, where constant tables do not give them. */
-static int find_places(StepData *s)
-{
-    Fused *f = s->fused;
-    size_t size = sizeof(double) * 3 * f->vertices;
-    if (!s->slides) return DONE;
-    memcpy(f->work, f->points, size);
-    memcpy(f->points, s->next_vertices, size);
-    int code = call(&f->curve_nodes);
-    memcpy(f->points, f->work, size);
-    return code || *f->nodes_are_right != 1.0 ? NO_VALUE : DONE;
-}
-
-/* The greatest distance of a station from its place on the curve; NaN stays. */
-static double greatest_gap(const StepData *s)
-{
-    const Fused *f = s->fused;
-    double worst = 0.0;
-    for (int k = 0; k < f->stations; k++) {
-        double square = 0.0;
-        for (int a = 0; a < 3; a++) {
-            double off = 0.0;
-            for (int i = 0; i < 3; i++)
-                off += f->station_weight[3 * k + i] * s->next_nodes[3 * f->station_node[3 * k + i] + a];
-            if (s->slides) off -= f->curve_nodes.res[0][3 * k + a];
-            for (int v = 0; v < f->vertices && !s->slides; v++)
-                off -= f->curve_weight[k * f->vertices + v] * s->next_vertices[3 * v + a];
-            square += off * off;
-        }
-        if (square > worst || square != square) worst = square;
-    }
-    return sqrt(worst);
+    if (!s->ending.eval) return DONE;
+    if (call(&s->ending)) return NO_VALUE;
+    if (*s->ending.res[1] != 0.0) return FLAWED;
+    if (s->curve_nodes.eval && (call(&s->curve_nodes) || *s->curve_nodes.res[2] != 1.0)) return NO_VALUE;
+    if (call(&s->gaps)) return NO_VALUE;
+    s->gap = *s->gaps.res[0];
+    return s->must_track && !(s->gap <= s->tracking) ? OFF_CURVE : DONE;
 }
 
 /* Whether every pair keeps its clearance at the present place of the way. */
@@ -570,11 +509,8 @@ static int arrive(StepData *s)
     if (put_nodes(s, f->q)) return NO_VALUE;
     memcpy(s->next_values, f->close.res[1], sizeof(double) * s->quantities);
     if (!is_flawless(s)) return FLAWED;
-    end_curve(s);
-    if (reverses(s)) return FLAWED;
-    if (find_places(s)) return NO_VALUE;
-    s->gap = greatest_gap(s);
-    if (s->must_track && !(s->gap <= s->tracking)) return OFF_CURVE;
+    int code = end_curve(s);
+    if (code) return code;
     for (int i = 0; i < f->coordinates; i++) s->next_motion[i] = s->next_q[i] - s->q[i];
     for (int m = 0; m < s->quantities; m++) s->next_rates[m] = (s->next_values[m] - s->values[m]) / s->duration;
     memcpy(s->next_tip, f->missing.res[1], sizeof(double) * 3);

@@ -550,8 +550,8 @@ def _numbers(layout: Layout) -> dict[str, Any]:
 
 
 def placement(layout: Layout) -> dict[str, Any]:
-    """Return by field what the C knows of the places of tip, stations and curve."""
-    stations, tip, tracked = layout.arm.stations, layout.arm.end_effector, layout.tracked
+    """Return by field what the C knows of the places of tip and curve."""
+    tip = layout.arm.end_effector
     return {
         "tips": len(layout.tip_rows),
         "legs": len(layout.legs),
@@ -562,17 +562,12 @@ def placement(layout: Layout) -> dict[str, Any]:
         "node_column": layout.node_column.astype(np.int32),
         "tip_nodes": len(tip.nodes),
         "tip_node": tip.nodes.astype(np.int32),
-        "stations": len(tracked),
-        "station_node": np.ascontiguousarray(stations.nodes[tracked], dtype=np.int32),
-        "station_weight": np.ascontiguousarray(stations.weights[tracked]),
-        "curve_weight": np.ascontiguousarray(layout.curve_weights),
-        "curve_slope": np.ascontiguousarray(layout.curve_slopes),
     }
 
 
 def _composition(layout: Layout, condense: Kernel) -> dict[str, Any]:
     """Return by field how the C weights the rows of stations and curve, with which it composes the QP."""
-    weights = layout.weights
+    weights, stations, tracked = layout.weights, layout.arm.stations, layout.tracked
     angles = np.array([weights.tangent, weights.tangent, weights.roll])[: layout.turns]
     gaps = np.where(layout.hard_gaps, 1.0, np.sqrt(weights.tracking))
     turns = np.where(layout.hard_tilts, 1.0, np.sqrt(angles))
@@ -582,6 +577,11 @@ def _composition(layout: Layout, condense: Kernel) -> dict[str, Any]:
         points, rows = (12 + CurveRows._fields.index(name) for name in ("position_rows", "spacing_rows"))
         curve = {"point_rows": condense.inputs[points], "stretch_rows": condense.inputs[rows]}
     return {
+        "stations": len(tracked),
+        "station_node": np.ascontiguousarray(stations.nodes[tracked], dtype=np.int32),
+        "station_weight": np.ascontiguousarray(stations.weights[tracked]),
+        "curve_weight": np.ascontiguousarray(layout.curve_weights),
+        "curve_slope": np.ascontiguousarray(layout.curve_slopes),
         "turned": layout.turns,
         "spacings": layout.spacings,
         "row_weight": np.concatenate([gaps.reshape(-1), turns.reshape(-1), spacings]),

@@ -245,36 +245,12 @@ class Layout:
         gain[2:] = np.linalg.pinv(np.array(rows)[:, 2:])
         return gain
 
-    def ended(self, vertices: Array, position: Array, rotation: Array) -> Array:
-        """Return (V, 3) the least changed control vertices whose curve ends at the tip's `position` (3,), m.
-
-        The curve ends along the z-axis of the tip's `rotation` (3, 3) if the direction is tracked. The length
-        of its slope is kept: a projection would shrink it from step to step.
-        """
-        if not self.ends_at_tip:
-            return vertices
-        missing = [position - self.curve_weights[-1] @ vertices]
-        if self.ends_along_tip:
-            slope, axis = self.curve_slopes[-1] @ vertices, rotation[:, 2]
-            missing.append(math.copysign(float(np.linalg.norm(slope)), slope @ axis) * axis - slope)
-        return np.asarray(vertices + self.end_gain @ np.array(missing))
-
     @cached_property
     def legs(self) -> Index:
         """(G, 2) control vertices of the legs with given directions: the first, and the last if along the tip."""
         last = self.vertices - 1
         legs = [(0, 1), (last - 1, last)][: int(last > 0) + self.ends_along_tip]
         return np.array(legs, dtype=np.int64).reshape(-1, 2)
-
-    def is_reversed(self, vertices: Array, normal: Array, rotation: Array) -> bool:
-        """Return whether a curve of vertices (V, 3) begins or ends against its direction.
-
-        Its direction at the base is the base's `normal` (3,). At the end it is the z-axis of the tip's
-        `rotation` (3, 3), if the curve ends along that.
-        """
-        if (vertices[1] - vertices[0]) @ normal < 0.0:
-            return True
-        return self.ends_along_tip and bool((vertices[-1] - vertices[-2]) @ rotation[:, 2] < 0.0)
 
     @property
     def least_leg(self) -> float:

@@ -8,6 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from vgtm_qp.arrays import Array, Index
+from vgtm_qp.compiled import Kernel
 from vgtm_qp.qp.answer import Accuracy, Move, StepSolution
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.numbers import ClearanceRows
@@ -56,13 +57,20 @@ class Workspace(Protocol):
 
     Attributes
     ----------
-    torsions : (T,)
-        Of the curve where the answer led, rad.
+    points, torsions : (3 V,), (T,)
+        The curve where the answer led, m and rad.
+    missing : Kernel
+        Its last results are the position and the rotation of the tip there.
+    curve_nodes : Kernel or None
+        The result of ``curve_rows.point_function`` there; None where constant tables describe the curve.
     shape : tuple of int
         Of a configuration.
     """
 
+    points: Array
     torsions: Array
+    missing: Kernel
+    curve_nodes: Kernel | None
     shape: tuple[int, ...]
 
     @property

@@ -13,7 +13,6 @@ import numpy as np
 from vgtm_qp.arrays import Array, record
 from vgtm_qp.errors import CurveError, EvaluationError, SolverError
 from vgtm_qp.qp.answer import Accuracy, Closed, Move
-from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.qp.residual import CONTRADICTION, AnswerError, FailedStepError, InfeasibleStepError
 from vgtm_qp.rows.tip import TipGoal
@@ -36,7 +35,7 @@ from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import Shortfall, State
 from vgtm_qp.step.step import WHOLE, Step, StepStatus
 from vgtm_qp.step.step_data import DEVIATION, LEAP, MOTION_MARGIN, SINGULAR
-from vgtm_qp.step.target import QPInput, Target, base_frame
+from vgtm_qp.step.target import QPInput, Target
 
 _MOST_FRACTIONS = 8
 """Greatest number of times between two states for which a QP has rows."""
@@ -312,10 +311,11 @@ class Attempt:
                 return blocked(flaw, solver_failed=True)
             q, closed = move.closed.q, move.closed
             # Linearised rows leave a small gap between the curve's end and the tip, which is closed here.
-            vertices = engine.layout.ended(move.vertices, closed.tip_position, closed.tip_rotation)
-            if self._reverses(engine.layout, vertices, target, closed):
+            tip = closed.tip_position, closed.tip_rotation
+            vertices, reverses = self._setup.arrival.ended(move.vertices, *tip, target.base)
+            if reverses:
                 return blocked("the curve would reverse where it begins or ends")
-            gap = self._setup.gap(q, vertices, move.torsion, target.base)
+            gap = self._setup.arrival.gap(q, vertices, move.torsion, target.base)
             if engine.layout.hard_tracking and not gap <= self.accuracy.tracking:
                 continue
             report, after = separation.proof(state, q, target.time, short)
@@ -352,12 +352,6 @@ class Attempt:
         if not self.separation.deviation(state.q, q) < DEVIATION * self._arm.height:
             return "the arm turns too far in one step"
         return self._too_long(self._arm.nodes(q) - state.nodes) if self._has_limit else ""
-
-    def _reverses(self, layout: Layout, vertices: Array, target: Target, closed: Closed) -> bool:
-        """Return whether a curve of vertices (V, 3) begins against the base's normal, or ends against the tip's."""
-        if not len(layout.legs):
-            return False
-        return layout.is_reversed(vertices, base_frame(self._arm, target.base)[:, 2], closed.tip_rotation)
 
     def _accepted(self, state: State, progress: float, gap: float, **of_qps: Any) -> Step:
         """Return the step to a proven `state` with the `gap` of its stations; `of_qps` are its fields of the QPs."""

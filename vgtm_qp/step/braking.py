@@ -233,7 +233,7 @@ class Brakes:
         report, found = separation.proof(state, closed.q, then, separation.shortfall_of(state))
         if found is None or not report.certified:
             return None
-        vertices = setup.layout.ended(vertices, closed.tip_position, closed.tip_rotation)
+        vertices, _ = setup.arrival.ended(vertices, closed.tip_position, closed.tip_rotation)
         still = self.shaping.target(state, self.dt, _NOWHERE, 0.0, 1.0, limits)
         flaw = attempt.acceptance.flaw(closed, state.q, still, None, vertices, state.torsion)
         if flaw or setup.too_long(arm.nodes(closed.q) - state.nodes):

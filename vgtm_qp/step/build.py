@@ -39,6 +39,7 @@ from vgtm_qp.qp.solvers import DEFAULT_SOLVER, StepSolver, available_solvers, de
 from vgtm_qp.qp.terms import Inequality, Objective, OwnTerms
 from vgtm_qp.rotation import rotation_from_vector
 from vgtm_qp.rows import curve as curve_rows
+from vgtm_qp.step.arrival import Arrival
 from vgtm_qp.step.chain_engine import ChainEngine
 from vgtm_qp.step.engine import Engine, FusedEngine, GeneralEngine
 from vgtm_qp.step.path import base_motion
@@ -210,13 +211,13 @@ def home_curve(problem: Problem, arm: Arm, task: TipTask) -> HomeCurve:
         shape=shape,
         vertex_goals=tuple(sorted(goal.index for goal in spec.control_vertex_goals)),
     )
-    end = arm.end_effector
-    ended = layout.ended(vertices, end.position(arm.home), end.frame)
+    arrival, tip = Arrival(layout), (arm.end_effector.position(arm.home), arm.end_effector.frame)
+    ended, _ = arrival.ended(vertices, *tip)
     if layout.ends_along_tip and np.abs(ended - vertices).max() > 1e-9 * arm.height:
         # The direction of the curve's end is to move the stations of a bent arm as little as possible.
-        along = layout.curve_slopes[-1], end.frame[:, 2]
+        along = layout.curve_slopes[-1], arm.end_effector.frame[:, 2]
         vertices = curve_rows.fitted(layout.curve_weights, centres[tracked], centres[0], normal, along)
-        ended = layout.ended(vertices, end.position(arm.home), end.frame)
+        ended, _ = arrival.ended(vertices, *tip)
     return HomeCurve(layout, ended, torsion, goals)
 
 

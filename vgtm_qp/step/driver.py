@@ -14,8 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vgtm_qp.arm.arm import Arithmetic, Pose
-from vgtm_qp.arrays import Array, record
-from vgtm_qp.errors import CurveError
+from vgtm_qp.arrays import record
 from vgtm_qp.geometry.pairs import Pair
 from vgtm_qp.geometry.watch import Watch
 from vgtm_qp.native import Code
@@ -220,8 +219,8 @@ class Driver:
                 self._cut(work, target.part(covered), first)
             self._solver.draw(state.control_vertices, None)
             code = self._called(self._arrays.correct)
-            found = self._passage(state, target) if code == Code.DONE else None
-            if found is not None:
+            if code == Code.DONE:
+                found = self._passage(state, target)
                 progress = covered * found.progress
                 return Passage(found.state, progress, found.gap, first.solution, begun.rows, qps)
             if code not in _AGAIN:
@@ -290,8 +289,8 @@ class Driver:
         if len(self._layout.tracked):
             self._arrays.base_normal[:] = base_frame(arm, pose)[:, 2]
 
-    def _passage(self, state: State, target: Target) -> Passage | None:
-        """Return the step that the call took; None where what it did not check itself does not hold."""
+    def _passage(self, state: State, target: Target) -> Passage:
+        """Return the step that the call took."""
         data, work, layout = self._arrays.data, self._work, self._layout
         block = self._arrays.after.copy()
         block.setflags(write=False)
@@ -299,10 +298,6 @@ class Driver:
         q, nodes = q.reshape(work.shape), nodes.reshape(-1, 3)
         vertices, progress, gap = vertices.reshape(-1, 3), work.data.reached, data.gap
         torsion = work.torsions.copy() if layout.torsion else state.torsion
-        if layout.hard_turns:
-            gap = _gap(self._setup, q, vertices, torsion, target.base)
-            if layout.hard_tracking and not gap <= self._accuracy.tracking:
-                return None
         time, late = state.after(target.duration)
         then = record(
             State,
@@ -368,11 +363,3 @@ def _corrects_nothing(target: Target, begun: Begun, rows: ClearanceRows) -> Deni
     point = move.q, move.q, move.vertices, move.torsion
     asked = QPInput(*point, target, target.goal(move.progress), move.progress, rows, False)
     return Denied(asked, begun.qps + 1, begun.first.solution, begun.rows)
-
-
-def _gap(setup: Setup, q: Array, vertices: Array, torsion: Array, base: Pose | None) -> float:
-    """Return the greatest gap or turn of a configuration, see ``Gap``; NaN if its curve has no frame somewhere."""
-    try:
-        return setup.gap(q, vertices, torsion, base)
-    except CurveError:
-        return np.nan

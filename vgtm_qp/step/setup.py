@@ -14,8 +14,8 @@ from vgtm_qp.arrays import Array
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.geometry.shapes import Obstacle
 from vgtm_qp.qp.layout import Layout
+from vgtm_qp.step.arrival import Arrival
 from vgtm_qp.step.engine import Engine
-from vgtm_qp.step.gap import Gap
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.state import State, frozen
 from vgtm_qp.step.task import TipTask
@@ -119,16 +119,13 @@ class Setup:
         return (self.measure or self.monitor).least(self.carrier.points(q), time, among=among)[0]
 
     @cached_property
-    def _gap(self) -> Gap:
-        return Gap(self.layout, self.kinematics)
-
-    def gap(self, q: Array, vertices: Array, torsion: Array, base: Pose | None) -> float:
-        """Return the greatest distance of a station from its curve node, m; see :class:`Gap`. NaN without a curve."""
-        return self._gap.greatest(q, vertices, torsion, base) if len(self.layout.tracked) else np.nan
+    def arrival(self) -> Arrival:
+        """The end of the curve, and the gaps of its stations, once a configuration is settled."""
+        return Arrival(self.layout)
 
     def gap_of(self, state: State) -> float:
-        """Return the greatest distance of a station from its curve node in a state, m; see :meth:`gap`."""
-        return self.gap(state.q, state.control_vertices, state.torsion, self.base_at(state.time))
+        """Return the greatest distance of a station from its curve node in a state, m; see ``Arrival.gap``."""
+        return self.arrival.gap(state.q, state.control_vertices, state.torsion, self.base_at(state.time))
 
     def base_at(self, time: float) -> Pose | None:
         """Return the pose of the base at `time`, s; None if it is at rest."""

@@ -14,11 +14,13 @@ from vgtm_qp.geometry.groups import Scene
 from vgtm_qp.geometry.watch import AHEAD
 from vgtm_qp.native import Program
 from vgtm_qp.qp.answer import Accuracy
+from vgtm_qp.qp.curve_rows import point_function
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.residual import TOLERANCE
 from vgtm_qp.qp.stepper import Workspace
 from vgtm_qp.rows.tip import axes
 from vgtm_qp.step.acceptance import LOOSER, ROUNDING
+from vgtm_qp.step.arrival import ending_function, gap_function, traced_shape
 from vgtm_qp.step.separation import MOST_PIECES
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import State
@@ -82,9 +84,6 @@ class StepData:
         moves = setup.base_motion is not None
         if moves:
             self.based_q, self.based_nodes = self.based_q.copy(), self.based_nodes.copy()
-        self.base_normal = np.zeros(3)
-        if len(layout.tracked):
-            self.base_normal[:] = base_frame(arm, None)[:, 2]
         self.make_room(_ROOM)
         self.is_placed = known.place is None
         kernels = {"place": known.place, "bend": known.bend, "levers": known.levers}
@@ -94,13 +93,15 @@ class StepData:
         of_points = {"points": self.before[self.parts[1]], "next_points": self.after[self.parts[1]]}
         of_points |= _of_points(arm, known.ends)
         self.points: Array | None = None if known.ends is None else of_points["points"]
+        if layout.vertices:
+            # The gaps of a layout that gives way are those of the tracking that was asked for.
+            self._end_curve(setup.layout, work)
         self.take, self.resume, self.correct = map(self.program.entry, ("take", "resume", "correct"))
         self.program.set(
             **work.structures,
             moves=int(moves),
             based_q=self.based_q,
             based_nodes=self.based_nodes,
-            base_normal=self.base_normal,
             influence=setup.influence,
             margin=setup.margin,
             motion_margin=MOTION_MARGIN,
@@ -111,9 +112,9 @@ class StepData:
             tip=LOOSER * accuracy.tip,
             tracking=accuracy.tracking,
             **_of_arm(arm, known),
+            must_track=int(layout.hard_tracking),
             **_of_tip(arm, layout),
             **_of_fcl(setup.monitor.scene),
-            **_of_curve(layout),
             **of_points,
             **given,
         )
@@ -136,6 +137,27 @@ class StepData:
             if part.stop <= len(self.before):
                 self.program.set(**{name: self.before[part]})
             self.program.set(**{f"next_{name}": self.after[part]})
+
+    def _end_curve(self, layout: Layout, work: Workspace) -> None:
+        """Let C end the curve of the next state, and measure its gaps; see ``Arrival``."""
+        ending, gaps = ending_function(layout).kernel(), gap_function(layout).kernel()
+        nodes, vertices = self.after[self.parts[1]], self.after[self.parts[2]]
+        self.base_normal = ending.inputs[3]
+        self.base_normal[:] = base_frame(layout.arm, None)[:, 2]
+        for argument, array in enumerate((work.points, *work.missing.outputs[1:])):
+            ending.bind_input(argument, array)
+        ending.bind_output(0, vertices)
+        gaps.bind_input(0, nodes)
+        gaps.bind_input(1, vertices)
+        if (shape := traced_shape(layout)) is not None:
+            assert work.curve_nodes is not None
+            traced = point_function(shape).kernel()
+            traced.bind_input(0, vertices)
+            for argument in (1, 2):
+                traced.bind_input(argument, work.curve_nodes.inputs[argument])
+                gaps.bind_input(1 + argument, traced.outputs[argument - 1])
+            self.program.set(curve_nodes=traced)
+        self.program.set(ending=ending, gaps=gaps)
 
     def load(self, state: State) -> None:
         """Write a state."""
@@ -189,19 +211,6 @@ def _of_tip(arm: Arm, layout: Layout) -> dict[str, object]:
         "axis": np.array(along, dtype=np.int32),
         "turns": len(layout.tip_rows) - len(along),
         "tip_weight": np.ascontiguousarray(arm.end_effector.weights, dtype=float),
-    }
-
-
-def _of_curve(layout: Layout) -> dict[str, object]:
-    """Return by field what the C knows of the curve beside its rows."""
-    if not len(layout.tracked):
-        return {}
-    return {
-        "ends_at_tip": int(layout.ends_at_tip),
-        "ends_along_tip": int(layout.ends_along_tip),
-        "must_track": int(layout.hard_tracking and not layout.hard_turns),
-        "slides": int(layout.general is not None and layout.general.by_arc_length),
-        "end_gain": np.ascontiguousarray(layout.end_gain),
     }
 
 

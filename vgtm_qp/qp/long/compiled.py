@@ -51,7 +51,8 @@ class CompiledChain:
         self._solver = solver
         self.layout, self._chain = solver.layout, solver.chain
         self.shape, self.torsions = solver.layout.arm.home_configuration.shape, np.zeros(0)
-        self._begin, self._missing = (
+        self.curve_nodes: Kernel | None = None
+        self._begin, self.missing = (
             begin_function(self.layout).kernel(),
             missing_tip_function(self.layout).kernel(),
         )
@@ -65,7 +66,7 @@ class CompiledChain:
     @property
     def kernels(self) -> tuple[Kernel, ...]:
         """The functions that C calls."""
-        return self._begin, self._missing, *self._functions.values()
+        return self._begin, self.missing, *self._functions.values()
 
     @property
     def is_ready(self) -> bool:
@@ -94,7 +95,7 @@ class CompiledChain:
         self._take(clearance)
         code = Code.CROWDED
         while code == Code.CROWDED:
-            self._points[:] = asked.vertices.reshape(-1)
+            self.points[:] = asked.vertices.reshape(-1)
             self._q[:] = self._begun[:] = asked.q
             code = self._program.call("chain_move", TOLERANCE)
             if code == Code.CROWDED:
@@ -119,14 +120,14 @@ class CompiledChain:
 
     def led(self, *, is_settled: bool) -> Move:
         """See :class:`~vgtm_qp.qp.stepper.Stepper`."""
-        data, points = self._program.data, self._points.reshape(-1, 3).copy()
+        data, points = self._program.data, self.points.reshape(-1, 3).copy()
         closed = self._closed(data.error) if is_settled else None
         way = self._begun.copy(), points, np.zeros(0), data.reached, data.furthest
         return Move(self.answered(), *way, closed)
 
     def _closed(self, error: float) -> Closed:
         """Return the configuration at which settling ended."""
-        _, position, rotation = self._missing.outputs
+        _, position, rotation = self.missing.outputs
         turned = rotation.reshape(3, 3).T.copy()
         return Closed(self._q.copy(), self._quantities.copy(), error, position.copy(), turned)
 
@@ -220,19 +221,19 @@ class CompiledChain:
         layout, arm = self.layout, self.layout.arm
         self._program = program = Program("Chain")
         self._q, self._at, self._begun = (np.zeros(arm.home.shape) for _ in range(3))
-        self._points, self._pull = self._begin.inputs[3], np.zeros((layout.vertices, 3))
+        self.points, self._pull = self._begin.inputs[3], np.zeros((layout.vertices, 3))
         self._x, self._y, self._lower, self._upper = (np.zeros(len(arm.actuators)) for _ in range(4))
         self._quantities = np.zeros(len(arm.quantity_names))
         for argument in (1, 2, 3, 4):
             # Goal, its turn, and the rates of both.
-            self._missing.bind_input(argument, self._begin.inputs[argument + 3])
+            self.missing.bind_input(argument, self._begin.inputs[argument + 3])
         program.set(
             begin=self._begin,
-            missing=self._missing,
+            missing=self.missing,
             q=self._q,
             at=self._at,
             begun=self._begun,
-            points=self._points,
+            points=self.points,
             pull=self._pull,
             x=self._x,
             y=self._y,
@@ -262,7 +263,7 @@ class CompiledChain:
         if layout.vertices:
             # The base rests at home, wherever this is called.
             begin[2][:] = layout.arm.home[layout.arm.stations.nodes[0]].reshape(-1)
-        state = self._q.reshape(-1), self._at.reshape(-1), base, self._points
+        state = self._q.reshape(-1), self._at.reshape(-1), base, self.points
         self._inputs = [*state, self._lower, self._upper, *begin[8:10], *begin[4:8]]
         self._step, values = Program("Fused"), [self._quantities] * 2
         self._addresses = [
@@ -273,12 +274,12 @@ class CompiledChain:
         self._step.set(
             condense=CompiledKernel(arg=arguments),
             close=CompiledKernel(res=results),
-            missing=self._missing,
+            missing=self.missing,
             q=self._q,
-            points=self._points,
+            points=self.points,
             started=self._begun,
-            started_points=self._points,
-            gone=self._missing.inputs[5],
+            started_points=self.points,
+            gone=self.missing.inputs[5],
             progress=begin[9],
             velocity=begin[6],
             spin=begin[7],
