@@ -13,6 +13,7 @@ from steps import drives_nothing
 import vgtm_qp as vq
 from vgtm_qp.arm.arm import Pose
 from vgtm_qp.arm.truss.arm import TrussArm, truss_of
+from vgtm_qp.compiled import Kernel
 from vgtm_qp.errors import GoalError, ProblemError, VgtmError
 from vgtm_qp.geometry import shapes
 from vgtm_qp.geometry.clearance import Clearance
@@ -21,7 +22,7 @@ from vgtm_qp.qp.full import FullBuilder
 from vgtm_qp.qp.linearise import Linearisation
 from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.rotation import rotation_from_vector, turn_between, vector_from_rotation
-from vgtm_qp.rows.clearance import clearance_rows
+from vgtm_qp.rows.clearance import allowed, allowed_function, clearance_rows
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.step import StepStatus
 from vgtm_qp.step.target import QPInput, Target
@@ -290,6 +291,26 @@ def test_clearance_rows_are_the_derivatives_of_the_exact_distances(name, fractio
                 pairs.name(k)
             )
     assert compared > 0.6 * len(lower)
+
+
+def test_arrays_and_c_have_the_same_bounds_of_a_step(rng):
+    """A pair that is far, near or too near; without a cap where it is driven apart."""
+    given = rng.normal(size=(5, 60))
+    given[1:4] = np.abs(given[1]), 0.1 * given[2], rng.choice([0.4, 1.0], 60)
+    given[1, ::7], given[4] = np.inf, 0.1 * np.abs(given[4])
+    kernel, expected = Kernel(allowed_function()), []
+    for column, found in zip(given.T, allowed(*given), strict=True):
+        missing, most, nearer, share, least = column
+        lower = min(missing, most) + nearer
+        # A clearance that remains may be used up to a share or `least`; one that is missing is asked for.
+        wanted = lower if lower >= -least else min(-least, share * lower)
+        for argument, value in zip(kernel.inputs, column, strict=True):
+            argument[:] = value
+        kernel()
+        assert found == pytest.approx(wanted, abs=1e-15)
+        assert kernel.outputs[0][0] == found
+        expected.append(wanted)
+    assert min(expected) < 0.0 < max(expected)
 
 
 def test_joined_clearance_rows_keep_their_names():

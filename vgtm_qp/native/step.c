@@ -38,9 +38,10 @@ typedef struct {
     Kernel ending, curve_nodes, gaps;
     int must_track;                        /* whether stations must be on the curve */
 
-    /* Clearances, the margin of their rows, the distance of pairs that are far, share and least of a pair's approach;
-       rounding of a distance. */
-    double safe, self_safe, margin, influence, share_of_way, least_way, rounding;
+    /* Clearances, the margin of their rows, the distance of pairs that are far, rounding of a distance; the bounds of
+       pairs in a step that moves the arm, see rows/clearance.py. */
+    double safe, self_safe, margin, influence, rounding;
+    Kernel allowed;
     double between, deviation;             /* violation that is allowed between states; greatest deviation from chords */
     /* Whether another program supplies the contacts of rows that press. Its unit of length per m; the greatest flaw of a
        proven answer, and the least distance of axes that have one, m. */
@@ -134,9 +135,12 @@ static int clearance_row(StepData *s, int k)
     }
     double lower = (p->is_self ? s->self_safe : s->safe) + s->margin - contact[0];
     if (!s->corrects) {
-        lower = fmin(lower, 2.0 * s->margin);
-        if (!p->is_self) lower += s->duration * dot(normal, s->way->velocity + 3 * p->listed[s->pair[k]].other, 3);
-        lower = fmax(lower, fmin(s->share_of_way * lower, -s->least_way));
+        double **arg = (double **)s->allowed.arg;
+        const double *velocity = s->way->velocity + (p->is_self ? 0 : 3 * p->listed[s->pair[k]].other);
+        *arg[0] = lower;
+        *arg[2] = p->is_self ? 0.0 : s->duration * dot(normal, velocity, 3);
+        if (call(&s->allowed)) return NO_VALUE;
+        lower = *s->allowed.res[0];
     }
     f->near_lower[k] = lower;
     /* Of the base's nodes the displacement is known; see ClearanceRows. */

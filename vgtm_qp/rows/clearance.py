@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import casadi as ca
 import numpy as np
 
 from vgtm_qp.arrays import Array, Mask
@@ -47,9 +50,18 @@ def clearance_rows(
     return coefficients, lower
 
 
-def slowed(lower: Array, share: float, least: float) -> Array:
-    """Return lower bounds (R,), m, with which a pair uses no more than a `share` of its remaining clearance in a step.
+def allowed(missing: Any, most: Any, nearer: Any, share: Any, least: Any, *, of: Any = np) -> Any:
+    """Return lower bounds, m, of how a step that moves the arm parts pairs: of arrays, or of symbols with `of` CasADi.
 
-    An approach of `least`, m, is allowed as far as `lower` allows it.
+    They ask for the `missing` clearance, but for no more than `most`, and for the way that an obstacle comes `nearer`
+    in the step. A pair uses no more than a `share` of the clearance that then remains, or `least` if that is more and
+    as far as it remains.
     """
-    return np.asarray(np.maximum(lower, np.minimum(share * lower, -least)))
+    lower = of.fmin(missing, most) + nearer
+    return of.fmax(lower, of.fmin(share * lower, -least))
+
+
+def allowed_function() -> ca.Function:
+    """Return the function (missing, most, nearer, share, least) of one pair, see :func:`allowed`."""
+    arguments = [ca.SX.sym(name) for name in ("missing", "most", "nearer", "share", "least")]
+    return ca.Function("allowed", arguments, [allowed(*arguments, of=ca)])

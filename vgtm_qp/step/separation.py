@@ -10,12 +10,13 @@ import math
 import numpy as np
 
 from vgtm_qp.arrays import Array, Index, Mask
+from vgtm_qp.compiled import Kernel
 from vgtm_qp.geometry.clearance import BetweenReport, Contacts, Pair
 from vgtm_qp.geometry.pairs import Wanted
 from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.qp.terms import OwnTerms
 from vgtm_qp.rows.angles import angle_gradients, angles, corners
-from vgtm_qp.rows.clearance import clearance_rows, slowed
+from vgtm_qp.rows.clearance import allowed, allowed_function, clearance_rows
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import Shortfall, State
 
@@ -55,21 +56,19 @@ class Separation:
         self._setup, self._arm, self._monitor = setup, setup.carrier, setup.monitor
         self._approach = _APPROACH if setup.slows_down else 1.0
         self._unit, self._rounding = setup.arm.unit, _ROUNDING * setup.arm.fineness
-        self._between = _BETWEEN * self._unit
+        self._least, self._between = _LEAST_APPROACH * self._unit, _BETWEEN * self._unit
         own = setup.layout.own
         self._own = own if own is not None and own.rows else None
         meeting = setup.monitor.bodies.joints
         self._corners = corners(meeting if setup.minimum_angle > 0.0 else meeting[:0])
 
     @property
-    def pace(self) -> dict[str, float]:
-        """By name what ``step.c`` knows: share and least of the approach of a slowing pair, and tolerances, m."""
-        return {
-            "share_of_way": self._approach,
-            "least_way": _LEAST_APPROACH * self._unit,
-            "rounding": self._rounding,
-            "between": self._between,
-        }
+    def pace(self) -> dict[str, Kernel | float]:
+        """By name what ``step.c`` knows: the bounds of pairs in a step, and tolerances, m."""
+        bounds = Kernel(allowed_function())
+        for argument, value in ((1, 2.0 * self._setup.margin), (3, self._approach), (4, self._least)):
+            bounds.inputs[argument][:] = value
+        return {"allowed": bounds, "rounding": self._rounding, "between": self._between}
 
     def shortfall(self, q: Array, time: float, *, tracked: bool = False) -> Shortfall:
         """Return the pairs that are too near at a configuration; usually there are none.
@@ -240,21 +239,17 @@ class Separation:
         self, rows: ClearanceRows, contacts: Contacts, duration: float, short: Shortfall, gain: float
     ) -> None:
         """Limit the approach of pairs in one step: overwrites ``rows.lower``; arguments as of :meth:`rows`."""
-        kept, motion = self._setup, duration > 0.0
-        if motion:
-            np.minimum(rows.lower, 2.0 * kept.margin, out=rows.lower)
+        kept, most = self._setup, np.full(len(contacts), 2.0 * self._setup.margin)
         if short:
             # Pairs that were too near are driven apart by the gain, but not beyond their clearance.
             floor = np.where(contacts.is_self, kept.self_safe, kept.safe)
             for k in np.flatnonzero(contacts.distance < floor).tolist():
                 before = short.get(contacts.pair(k))
                 if before is not None:
-                    rows.lower[k] = min(before + gain, floor[k]) - contacts.distance[k]
-        if motion:
-            if self._monitor.pieces.moving:
-                rows.lower += contacts.normal_speed * duration
-            # `lower` now has the remaining clearance after the obstacles' motion.
-            rows.lower = slowed(rows.lower, self._approach, _LEAST_APPROACH * self._unit)
+                    rows.lower[k], most[k] = min(before + gain, floor[k]) - contacts.distance[k], np.inf
+        if duration > 0.0:
+            nearer = contacts.normal_speed * duration
+            rows.lower = allowed(rows.lower, most, nearer, self._approach, self._least)
 
     def with_rows_between(
         self, rows: ClearanceRows, state: State, q: Array, time: float, fractions: list[float]
