@@ -17,7 +17,7 @@ from vgtm_qp import parts
 from vgtm_qp.curve.families import b_spline, beta_spline
 from vgtm_qp.parts import find_part, part_names
 from vgtm_qp.qp.daqp import DAQP
-from vgtm_qp.qp.dense import EQUALITY
+from vgtm_qp.qp.dense import EQUALITY, DenseQP
 from vgtm_qp.qp.numbers import UNBOUNDED
 from vgtm_qp.rotation import rotation_from_vector
 
@@ -341,9 +341,8 @@ class ByDaqp:
     def __call__(self, P: Any, q: Any, A: Any, lower: Any, upper: Any) -> Any:
         type(self).asked += 1
         assert np.array_equal(np.isposinf(upper), upper > 1e20)
-        found = DAQP.ask(
-            P, q, A, np.maximum(lower, -UNBOUNDED), np.minimum(upper, UNBOUNDED), sense(lower, upper)
-        )
+        bounds = np.maximum(lower, -UNBOUNDED), np.minimum(upper, UNBOUNDED), sense(lower, upper)
+        found = DAQP.ask(DenseQP(P, q, A, *bounds))
         for array in (P, q, A, lower, upper):
             array[:] = np.nan
         return self.spoil(found.x, found.multipliers)

@@ -21,7 +21,7 @@ from vgtm_qp.problem.method import Weights
 from vgtm_qp.qp.answer import StepSolution
 from vgtm_qp.qp.condensed import CondensedSolver
 from vgtm_qp.qp.daqp import DAQP
-from vgtm_qp.qp.dense import DenseAnswer, check, residuals
+from vgtm_qp.qp.dense import DenseAnswer, DenseQP, check, residuals
 from vgtm_qp.qp.full import FullBuilder
 from vgtm_qp.qp.linearise import Linearisation, StepInput
 from vgtm_qp.qp.numbers import ClearanceRows, Legs, StepNumbers
@@ -440,8 +440,8 @@ class Spoilt:
     def __init__(self, spoil):
         self._spoil = spoil
 
-    def ask(self, *qp):
-        answer = DAQP.ask(*qp)
+    def ask(self, qp):
+        answer = DAQP.ask(qp)
         x, y = self._spoil(answer.x, answer.multipliers)
         return answer._replace(x=x, multipliers=y)
 
@@ -474,13 +474,13 @@ def test_a_feasible_answer_that_is_not_optimal_is_refused():
     rng = np.random.default_rng(52)
     root, gradient = rng.normal(size=(6, 6)), rng.normal(size=6)
     hessian, rows, x = root @ root.T + np.eye(6), rng.normal(size=(2, 6)), 0.1 * rng.normal(size=6)
-    qp = hessian, gradient, rows, np.full(8, -9.0), np.full(8, 9.0)
+    qp = DenseQP(hessian, gradient, rows, np.full(8, -9.0), np.full(8, 9.0), np.zeros(8, dtype=np.int32))
     of_bounds = -(hessian @ x + gradient)
     answer = DenseAnswer(x, np.concatenate([of_bounds, np.zeros(2)]), 1, "any")
-    assert residuals(answer, *qp)[0] == 0.0
+    assert residuals(answer, qp)[0] == 0.0
     with pytest.raises(SolverError, match="dual residual"):
-        check(answer, *qp)
-    check(DAQP.ask(*qp, np.zeros(8, dtype=np.int32)), *qp)
+        check(answer, qp)
+    check(DAQP.ask(qp), qp)
 
 
 def test_garbage_from_a_library_is_refused(monkeypatch):

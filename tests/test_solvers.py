@@ -8,7 +8,7 @@ import pytest
 
 import vgtm_qp as vq
 from vgtm_qp.qp.daqp import DAQP
-from vgtm_qp.qp.dense import EQUALITY, DenseAnswer, check, residuals
+from vgtm_qp.qp.dense import EQUALITY, DenseAnswer, DenseQP, check, residuals
 from vgtm_qp.qp.numbers import UNBOUNDED
 from vgtm_qp.qp.osqp import AGAIN, FIRST, Osqp
 from vgtm_qp.qp.residual import AnswerError, InfeasibleStepError
@@ -34,7 +34,8 @@ def random_qp(rng, rows, *, bounded=BOUNDED):
     upper[bounded + 2 :: 3], lower[bounded + 3 :: 3] = UNBOUNDED, -UNBOUNDED
     sense = np.zeros(len(values), dtype=np.int32)
     sense[equal] = EQUALITY
-    return root @ root.T + 0.1 * np.eye(SIZE), rng.normal(size=SIZE), constraint, lower, upper, sense
+    hessian = root @ root.T + 0.1 * np.eye(SIZE)
+    return DenseQP(hessian, rng.normal(size=SIZE), constraint, lower, upper, sense)
 
 
 @pytest.fixture
@@ -55,9 +56,9 @@ def set_ups(monkeypatch):
 def test_every_solver_has_daqp_s_answer(name, bounded):
     rng, solver, active = np.random.default_rng(1), dense_solver(name), 0
     for rows in (5, 2, 11, 4, 3):
-        *qp, sense = random_qp(rng, rows, bounded=bounded)
-        found, wanted = solver.ask(*qp, sense), DAQP.ask(*qp, sense)
-        check(wanted, *qp)
+        qp = random_qp(rng, rows, bounded=bounded)
+        found, wanted = solver.ask(qp), DAQP.ask(qp)
+        check(wanted, qp)
         np.testing.assert_allclose(found.x, wanted.x, atol=1e-6)
         np.testing.assert_allclose(found.multipliers, wanted.multipliers, atol=1e-5)
         active += np.count_nonzero(wanted.multipliers)
@@ -66,35 +67,34 @@ def test_every_solver_has_daqp_s_answer(name, bounded):
 
 @pytest.mark.parametrize("name", ["daqp", *OTHERS])
 def test_rows_that_contradict_one_another_are_infeasible(name):
-    *qp, sense = random_qp(np.random.default_rng(2), 4)
-    _, _, constraint, lower, upper = qp
+    qp = random_qp(np.random.default_rng(2), 4)
+    constraint, lower, upper = qp[2:5]
     constraint[3] = constraint[2]
     lower[-2:], upper[-2:] = (-UNBOUNDED, 0.1), (0.0, UNBOUNDED)
     with pytest.raises(InfeasibleStepError):
-        dense_solver(name).ask(*qp, sense)
+        dense_solver(name).ask(qp)
 
 
 def test_osqp_is_set_up_once_and_grows_by_doubling(set_ups):
     rng, solver = np.random.default_rng(3), Osqp()
     for rows in (4, 12, 2, 9, 13, 24, 3, 25, 30):
-        *qp, sense = random_qp(rng, rows)
-        np.testing.assert_allclose(solver.ask(*qp, sense).x, DAQP.ask(*qp, sense).x, atol=1e-7)
+        qp = random_qp(rng, rows)
+        np.testing.assert_allclose(solver.ask(qp).x, DAQP.ask(qp).x, atol=1e-7)
     assert set_ups == [BOUNDED + capacity for capacity in (12, 24, 48)]
 
 
 def test_osqp_starts_from_its_last_answer_also_with_more_rows():
     solver = Osqp()
-    hessian, gradient, constraint, lower, upper, sense = random_qp(np.random.default_rng(4), 4)
-    cold = solver.ask(hessian, gradient, constraint, lower, upper, sense)
-    again = solver.ask(hessian, gradient + 1e-6, constraint, lower, upper, sense)
-    free, open_ends = np.zeros((9, SIZE)), np.full(9, UNBOUNDED)
+    qp = random_qp(np.random.default_rng(4), 4)
+    cold, again = solver.ask(qp), solver.ask(qp._replace(gradient=qp.gradient + 1e-6))
+    open_ends = np.full(9, UNBOUNDED)
     more = solver.ask(
-        hessian,
-        gradient,
-        np.concatenate([constraint, free]),
-        np.concatenate([lower, -open_ends]),
-        np.concatenate([upper, open_ends]),
-        np.concatenate([sense, np.zeros(9, dtype=np.int32)]),
+        qp._replace(
+            constraint=np.concatenate([qp.constraint, np.zeros((9, SIZE))]),
+            lower=np.concatenate([qp.lower, -open_ends]),
+            upper=np.concatenate([qp.upper, open_ends]),
+            sense=np.concatenate([qp.sense, np.zeros(9, dtype=np.int32)]),
+        )
     )
     assert max(again.iterations, more.iterations) < cold.iterations
     np.testing.assert_allclose(more.x, cold.x, atol=1e-9)
@@ -103,9 +103,9 @@ def test_osqp_starts_from_its_last_answer_also_with_more_rows():
 def test_osqp_tries_again_where_the_first_answer_is_not_accurate(set_ups):
     rng, solver = np.random.default_rng(5), Osqp({**FIRST, "max_iter": 10})
     for _ in range(3):
-        *qp, sense = random_qp(rng, 4)
-        answer = solver.ask(*qp, sense)
-        assert max(residuals(answer, *qp)) <= solver.accuracy
+        qp = random_qp(rng, 4)
+        answer = solver.ask(qp)
+        assert max(residuals(answer, qp)) <= solver.accuracy
     assert 1 < len(set_ups) <= 1 + len(AGAIN)
 
 
@@ -114,12 +114,12 @@ def test_osqp_tries_again_where_the_first_answer_is_not_accurate(set_ups):
 @pytest.mark.parametrize("name", OTHERS)
 def test_what_is_not_a_number_is_refused_and_forgotten(name, part, wrong):
     solver, rng = dense_solver(name), np.random.default_rng(6)
-    *qp, sense = random_qp(rng, 4)
-    spoilt = [array.copy() for array in qp]
+    qp = random_qp(rng, 4)
+    spoilt = DenseQP(*(array.copy() for array in qp))
     spoilt[part].flat[0] = wrong
     with pytest.raises(AnswerError, match="NaN"):
-        solver.ask(*spoilt, sense)
-    np.testing.assert_allclose(solver.ask(*qp, sense).x, DAQP.ask(*qp, sense).x, atol=1e-6)
+        solver.ask(spoilt)
+    np.testing.assert_allclose(solver.ask(qp).x, DAQP.ask(qp).x, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["osqp", "piqp"])
@@ -172,6 +172,7 @@ def test_an_answer_beyond_all_numbers_is_refused(part):
     """Its square would overflow, and its dual residual over that be zero."""
     answer = DenseAnswer(np.zeros(2), np.zeros(2), 0, "a solver")
     answer = answer._replace(**{part: np.array([1e194, 0.0])})
-    qp = np.eye(2), np.ones(2), np.zeros((0, 2)), np.full(2, -1e30), np.full(2, 1e30)
+    bounds = np.full(2, -1e30), np.full(2, 1e30), np.zeros(2, dtype=np.int32)
+    qp = DenseQP(np.eye(2), np.ones(2), np.zeros((0, 2)), *bounds)
     with pytest.raises(AnswerError):
-        check(answer, *qp)
+        check(answer, qp)

@@ -13,7 +13,7 @@ from vgtm_qp.compiled import compiler
 from vgtm_qp.errors import SolverError
 from vgtm_qp.native import building
 from vgtm_qp.qp.daqp import DAQP
-from vgtm_qp.qp.dense import DenseAnswer
+from vgtm_qp.qp.dense import DenseAnswer, DenseQP
 from vgtm_qp.qp.fused import FusedSolver
 from vgtm_qp.qp.residual import AnswerError, InfeasibleStepError
 
@@ -28,8 +28,8 @@ class Listening:
     def __init__(self) -> None:
         self.answer: DenseAnswer | None = None
 
-    def ask(self, *qp: np.ndarray) -> DenseAnswer:
-        self.answer = DAQP.ask(*qp)
+    def ask(self, qp: DenseQP) -> DenseAnswer:
+        self.answer = DAQP.ask(qp)
         return self.answer
 
 

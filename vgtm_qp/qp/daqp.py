@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import daqp
 import numpy as np
-from numpy.typing import NDArray
 
-from vgtm_qp.arrays import Array
-from vgtm_qp.qp.dense import DenseAnswer, DenseSolver
+from vgtm_qp.qp.dense import DenseAnswer, DenseQP, DenseSolver
 from vgtm_qp.qp.residual import CONTRADICTION, InfeasibleStepError
 
 
@@ -17,16 +15,9 @@ class Daqp:
     def __init__(self, fineness: float = 1.0) -> None:
         self.accuracy = 1e-10 * fineness
 
-    def ask(
-        self,
-        hessian: Array,
-        gradient: Array,
-        constraint: Array,
-        lower: Array,
-        upper: Array,
-        sense: NDArray[np.int32],
-    ) -> DenseAnswer:
+    def ask(self, qp: DenseQP) -> DenseAnswer:
         """See :class:`vgtm_qp.qp.dense.DenseSolver`."""
+        hessian, gradient, constraint, lower, upper, sense = qp
         x, _, flag, info = daqp.solve(
             hessian, gradient, constraint, upper, lower, sense, primal_tol=self.accuracy, eps_prox=0.0
         )

@@ -24,6 +24,30 @@ _GREATEST = 1e100
 """Greatest number of an answer: squares of much greater ones overflow, and residuals over infinity would be zero."""
 
 
+class DenseQP(NamedTuple):
+    """What a solver is asked.
+
+    Attributes
+    ----------
+    hessian, gradient : (n, n), (n,)
+    constraint : (m, n)
+    lower, upper, sense : (b + m,)
+        Bounds, first of b unknowns; infinite ones are ``numbers.UNBOUNDED``. `sense` is ``EQUALITY`` or 0.
+    """
+
+    hessian: Array
+    gradient: Array
+    constraint: Array
+    lower: Array
+    upper: Array
+    sense: NDArray[np.int32]
+
+    @property
+    def bounded(self) -> int:
+        """Number b of unknowns with bounds."""
+        return len(self.lower) - len(self.constraint)
+
+
 class DenseAnswer(NamedTuple):
     """A solver's answer to a dense QP.
 
@@ -57,23 +81,8 @@ class DenseSolver(Protocol):
 
     accuracy: float
 
-    def ask(
-        self,
-        hessian: Array,
-        gradient: Array,
-        constraint: Array,
-        lower: Array,
-        upper: Array,
-        sense: NDArray[np.int32],
-    ) -> DenseAnswer:
+    def ask(self, qp: DenseQP) -> DenseAnswer:
         """Return the answer, in new arrays.
-
-        Parameters
-        ----------
-        hessian, gradient : (n, n), (n,)
-        constraint : (m, n)
-        lower, upper, sense : (b + m,)
-            Bounds, first of b unknowns; infinite ones are ``numbers.UNBOUNDED``. `sense` is ``EQUALITY`` or 0.
 
         Raises
         ------
@@ -86,9 +95,7 @@ class DenseSolver(Protocol):
         ...
 
 
-def residuals(
-    answer: DenseAnswer, hessian: Array, gradient: Array, constraint: Array, lower: Array, upper: Array
-) -> tuple[float, float]:
+def residuals(answer: DenseAnswer, qp: DenseQP) -> tuple[float, float]:
     """Return the primal residual of an answer, m or rad, and the dual one, relative to the objective's forces.
 
     The dual residual is the greater of two norms: of H x + g + multipliers, and of what is :func:`loose`.
@@ -97,31 +104,28 @@ def residuals(
     # A comparison with NaN is false, too.
     if not (np.abs(x).max(initial=0.0) < _GREATEST and np.abs(y).max(initial=0.0) < _GREATEST):
         return np.nan, np.nan
-    bounded = len(y) - len(constraint)
-    values = np.concatenate((x[:bounded], constraint @ x))
-    stationarity = hessian @ x
-    stationarity += gradient
-    stationarity[:bounded] += y[:bounded]
-    stationarity += y[bounded:] @ constraint
-    dual = relative(max(norm(stationarity), loose(y, values, lower, upper)), gradient, y)
-    return norm(beyond(values, lower, upper)), dual
+    values = np.concatenate((x[: qp.bounded], qp.constraint @ x))
+    stationarity = qp.hessian @ x
+    stationarity += qp.gradient
+    stationarity[: qp.bounded] += y[: qp.bounded]
+    stationarity += y[qp.bounded :] @ qp.constraint
+    dual = relative(max(norm(stationarity), loose(y, values, qp.lower, qp.upper)), qp.gradient, y)
+    return norm(beyond(values, qp.lower, qp.upper)), dual
 
 
-def check(
-    answer: DenseAnswer, hessian: Array, gradient: Array, constraint: Array, lower: Array, upper: Array
-) -> None:
-    """Refuse an answer whose residuals are too large; the QP is that of :meth:`DenseSolver.ask`.
+def check(answer: DenseAnswer, qp: DenseQP) -> None:
+    """Refuse an answer whose residuals are too large.
 
     Raises
     ------
     AnswerError
         See :func:`vgtm_qp.qp.residual.refuse_large`.
     """
-    refuse_large(*residuals(answer, hessian, gradient, constraint, lower, upper), answer.status)
+    refuse_large(*residuals(answer, qp), answer.status)
 
 
-def check_question(solver: str, *arrays: Array) -> None:
-    """Refuse a QP that an iterative solver must not get, since NaN would stay in it; the bounds come last.
+def check_question(solver: str, qp: DenseQP) -> None:
+    """Refuse a QP that an iterative solver must not get, since NaN would stay in it.
 
     Raises
     ------
@@ -130,8 +134,7 @@ def check_question(solver: str, *arrays: Array) -> None:
     InfeasibleStepError
         A lower bound is above its upper bound.
     """
-    if not all(math.isfinite(array.sum()) for array in arrays):
+    if not all(math.isfinite(array.sum()) for array in qp):
         raise AnswerError(f"{solver} was not asked: the QP has an infinite number or NaN")
-    lower, upper = arrays[-2:]
-    if (lower > upper).any():
+    if (qp.lower > qp.upper).any():
         raise InfeasibleStepError("a lower bound is above its upper bound")

@@ -24,7 +24,7 @@ from vgtm_qp.native import Code, Program, building
 from vgtm_qp.qp.answer import Accuracy, Closed, CurvePoint, Move, Settled, StepSolution
 from vgtm_qp.qp.curve_rows import curve_function, point_function
 from vgtm_qp.qp.daqp import DAQP, Daqp
-from vgtm_qp.qp.dense import EQUALITY, DenseSolver
+from vgtm_qp.qp.dense import EQUALITY, DenseQP, DenseSolver
 from vgtm_qp.qp.fused_rows import RESULTS, row_function
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.linearise import StepInput
@@ -113,9 +113,23 @@ class FusedSolver:
         return self.workspace.kernels
 
     @property
-    def corrects(self) -> bool:
+    def corrector(self) -> FusedSolver:
         """See :class:`~vgtm_qp.qp.stepper.Stepper`."""
-        return True
+        return self
+
+    def point(self) -> tuple[Array, Array, Array, float]:
+        """See :class:`~vgtm_qp.qp.stepper.Corrector`."""
+        work = self.workspace
+        q, vertices, progress = (work.inputs[k].copy() for k in (0, 3, 7))
+        torsion = np.zeros(0) if work.curve is None else work.curve.inputs[1].copy()
+        return q.reshape(work.shape), vertices.reshape(-1, 3), torsion, float(progress[0])
+
+    def go_back(self, move: Move) -> None:
+        """See :class:`~vgtm_qp.qp.stepper.Corrector`."""
+        work = self.workspace
+        work.started[:], work.started_points[:] = move.q.reshape(-1), move.vertices.reshape(-1)
+        work.started_torsions[:] = move.torsion
+        work.gone[0], work.data.reached = 0.0, 1.0
 
     def load(self, asked: StepInput) -> None:
         """Set the state, the goal and the boxes of the next QP."""
@@ -322,11 +336,9 @@ class FusedWorkspace:
         """Ask the solver for the QP's answer, on behalf of C; its error is raised once C has returned."""
         rows = self.first_near + self.data.near
         count = self.size + rows
-        bounds = self.lower[:count], self.upper[:count]
+        bounds = self.lower[:count], self.upper[:count], self._sense[:count]
         try:
-            answer = self.solver.ask(
-                self.hessian, self.gradient, self.constraint[:rows], *bounds, self._sense[:count]
-            )
+            answer = self.solver.ask(DenseQP(self.hessian, self.gradient, self.constraint[:rows], *bounds))
         except Exception as error:  # a solver of the user's own raises anything, and C cannot hand it on
             self._failure = error
             return Code.FAILED

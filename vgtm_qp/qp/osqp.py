@@ -7,11 +7,9 @@ from typing import Any
 
 import numpy as np
 import osqp
-from numpy.typing import NDArray
 from scipy import sparse
 
-from vgtm_qp.arrays import Array
-from vgtm_qp.qp.dense import DenseAnswer, check, check_question, residuals
+from vgtm_qp.qp.dense import DenseAnswer, DenseQP, check, check_question, residuals
 from vgtm_qp.qp.numbers import UNBOUNDED
 from vgtm_qp.qp.residual import TOLERANCE, AnswerError, InfeasibleStepError
 
@@ -70,27 +68,18 @@ class Osqp:
         self._workspace: _OsqpWorkspace | None = None
         self._further: list[_OsqpWorkspace] = []
 
-    def ask(
-        self,
-        hessian: Array,
-        gradient: Array,
-        constraint: Array,
-        lower: Array,
-        upper: Array,
-        sense: NDArray[np.int32],  # noqa: ARG002
-    ) -> DenseAnswer:
+    def ask(self, qp: DenseQP) -> DenseAnswer:
         """See :class:`vgtm_qp.qp.dense.DenseSolver`."""
-        check_question("osqp", hessian, gradient, constraint, lower, upper)
-        qp = hessian, gradient, constraint, lower, upper
-        workspace = self._workspace_for(len(gradient), len(lower) - len(constraint), len(constraint))
+        check_question("osqp", qp)
+        workspace = self._workspace_for(len(qp.gradient), qp.bounded, len(qp.constraint))
         # A workspace is used again only after an accurate answer, or a proof that there is none: a poor
         # answer would start the next QP far off.
         self._workspace = None
         try:
-            answer = workspace.solved(*qp)
-            off = np.inf if answer is None else max(residuals(answer, *qp))
+            answer = workspace.solved(qp)
+            off = np.inf if answer is None else max(residuals(answer, qp))
             if not off <= self.accuracy:
-                answer = self._again(workspace, answer, off, *qp)
+                answer = self._again(workspace, answer, off, qp)
         except InfeasibleStepError:
             self._workspace = workspace
             raise
@@ -108,7 +97,7 @@ class Osqp:
         return _OsqpWorkspace(size, bounded, max(rows, 2 * old.sizes[2]), self._first, start=old.last)
 
     def _again(
-        self, workspace: _OsqpWorkspace, answer: DenseAnswer | None, off: float, *qp: Array
+        self, workspace: _OsqpWorkspace, answer: DenseAnswer | None, off: float, qp: DenseQP
     ) -> DenseAnswer:
         """Return an accurate answer by further tries after one of residual `off`; the next QP starts there.
 
@@ -121,15 +110,15 @@ class Osqp:
             self._further = [_OsqpWorkspace(*workspace.sizes, settings) for settings in self._after]
         for further in self._further:
             further.restart(answer if off <= _NEAR else None)
-            found = further.solved(*qp)
-            apart = np.inf if found is None else max(residuals(found, *qp))
+            found = further.solved(qp)
+            apart = np.inf if found is None else max(residuals(found, qp))
             if apart <= off:
                 answer, off = found, apart
             if off <= TOLERANCE:
                 break
         if answer is None:
             raise AnswerError("osqp: neither an answer nor a proof that there is none")
-        check(answer, *qp)
+        check(answer, qp)
         workspace.start(answer)
         return answer
 
@@ -184,9 +173,7 @@ class _OsqpWorkspace:
             self._solver.update_settings(rho=self._settings["rho"])
             self.start(answer)
 
-    def solved(
-        self, hessian: Array, gradient: Array, constraint: Array, lower: Array, upper: Array
-    ) -> DenseAnswer | None:
+    def solved(self, qp: DenseQP) -> DenseAnswer | None:
         """Return the answer by iterations from the last one and by polishing; None if OSQP finds none.
 
         Raises
@@ -194,7 +181,7 @@ class _OsqpWorkspace:
         InfeasibleStepError
             OSQP proved that there is no answer.
         """
-        self._load(hessian, gradient, constraint, lower, upper)
+        self._load(qp)
         result = self._solver.solve(raise_error=False)
         status, x, y, self.last = f"osqp: {result.info.status}", result.x, result.y, None
         if result.info.status_val == osqp.SolverStatus.OSQP_PRIMAL_INFEASIBLE:
@@ -205,8 +192,9 @@ class _OsqpWorkspace:
         self.last = DenseAnswer(np.array(x), multipliers, int(result.info.iter), status)
         return self.last
 
-    def _load(self, hessian: Array, gradient: Array, constraint: Array, lower: Array, upper: Array) -> None:
+    def _load(self, qp: DenseQP) -> None:
         """Write a QP; unknowns and multipliers stay those of the last answer."""
+        hessian, gradient, constraint, lower, upper, _ = qp
         rows, self._used = len(constraint), len(lower)
         np.take(hessian, self._upper_triangle, out=self._hessian.data)
         self._first[:, :rows] = constraint[:, : self._bounded].T

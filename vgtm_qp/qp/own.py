@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from vgtm_qp.arrays import Array
 from vgtm_qp.errors import PartError
 from vgtm_qp.parts import Part
-from vgtm_qp.qp.dense import DenseAnswer, check, check_question
+from vgtm_qp.qp.dense import DenseAnswer, DenseQP, check, check_question
 from vgtm_qp.qp.numbers import infinite
 from vgtm_qp.qp.residual import AnswerError, NoAnswerError
 
@@ -32,19 +30,11 @@ class OwnSolver:
         self._solve = part() if isinstance(part, type) else part
         self.accuracy = float(getattr(self._solve, "accuracy", 1e-8))
 
-    def ask(
-        self,
-        hessian: Array,
-        gradient: Array,
-        constraint: Array,
-        lower: Array,
-        upper: Array,
-        sense: NDArray[np.int32],  # noqa: ARG002
-    ) -> DenseAnswer:
+    def ask(self, qp: DenseQP) -> DenseAnswer:
         """See :class:`vgtm_qp.qp.dense.DenseSolver`; PartError where the function returns no such arrays."""
-        check_question(self._name, hessian, gradient, constraint, lower, upper)
-        size, bounded = len(gradient), len(lower) - len(constraint)
-        rows = np.concatenate([np.eye(size)[:bounded], constraint])
+        check_question(self._name, qp)
+        (hessian, gradient, constraint, lower, upper, _), size = qp, len(qp.gradient)
+        rows = np.concatenate([np.eye(size)[: qp.bounded], constraint])
         try:
             answer = self._solve(hessian.copy(), gradient.copy(), rows, infinite(lower), infinite(upper))
         except (ValueError, ArithmeticError) as error:
@@ -58,7 +48,7 @@ class OwnSolver:
         if x.shape != (size,) or multipliers.shape != (len(lower),):
             raise self._unfit(f"arrays of the shapes {x.shape} and {multipliers.shape}", size, len(lower))
         found = DenseAnswer(x, multipliers, 0, self._name)
-        check(found, hessian, gradient, constraint, lower, upper)
+        check(found, qp)
         return found
 
     def _unfit(self, found: str, size: int, rows: int) -> PartError:

@@ -19,7 +19,7 @@ from vgtm_qp.parts import find_part, part_names
 from vgtm_qp.qp.answer import StepSolution
 from vgtm_qp.qp.condensed import CondensedSolver
 from vgtm_qp.qp.daqp import DAQP
-from vgtm_qp.qp.dense import DenseAnswer, DenseSolver, check, check_question
+from vgtm_qp.qp.dense import DenseAnswer, DenseQP, DenseSolver, check, check_question
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.long.select import chain_solver, prefers_staged
 from vgtm_qp.qp.numbers import StepNumbers, infinite
@@ -119,20 +119,12 @@ class _QpSolvers:
         self._name = name
         self._matrix = np.asarray if name in qpsolvers.dense_solvers else sparse.csc_matrix
 
-    def ask(
-        self,
-        hessian: Array,
-        gradient: Array,
-        constraint: Array,
-        lower: Array,
-        upper: Array,
-        sense: NDArray[np.int32],  # noqa: ARG002
-    ) -> DenseAnswer:
+    def ask(self, qp: DenseQP) -> DenseAnswer:
         """See :class:`vgtm_qp.qp.dense.DenseSolver`."""
         import qpsolvers
 
-        check_question(self._name, hessian, gradient, constraint, lower, upper)
-        bounded = len(lower) - len(constraint)
+        check_question(self._name, qp)
+        (hessian, gradient, constraint, lower, upper, _), bounded = qp, qp.bounded
         box = [np.full(len(gradient), bound) for bound in (-np.inf, np.inf)]
         box[0][:bounded], low = np.split(infinite(lower), [bounded])
         box[1][:bounded], high = np.split(infinite(upper), [bounded])
@@ -159,7 +151,7 @@ class _QpSolvers:
         # The multipliers of the bounds follow from stationarity.
         of_bounds = -(hessian @ answer.x + gradient + y @ constraint)[:bounded]
         found = DenseAnswer(np.array(answer.x), np.concatenate([of_bounds, y]), 0, self._name)
-        check(found, hessian, gradient, constraint, lower, upper)
+        check(found, qp)
         return found
 
     def _solved(self, problem: Any) -> Any:

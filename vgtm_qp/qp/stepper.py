@@ -99,6 +99,16 @@ class Workspace(Protocol):
         """Return nodes (R, S), coefficients (R, S, 3) and bounds (R,) of the first rows of clearance."""
 
 
+class Corrector(Protocol):
+    """Goes on by further QPs in C after an answer that is no step yet."""
+
+    def point(self) -> tuple[Array, Array, Array, float]:
+        """Return where the QP solved last was linearised: configuration, control vertices, torsion and progress."""
+
+    def go_back(self, move: Move) -> None:
+        """Linearise the next QP where a `move` led, at the end of its piece of path."""
+
+
 class Stepper(Protocol):
     """Solves the QP of a step and settles where its answer leads, by C."""
 
@@ -109,8 +119,8 @@ class Stepper(Protocol):
         """The arrays of its QP."""
 
     @property
-    def corrects(self) -> bool:
-        """Whether C goes on by further QPs after an answer that is no step yet, and follows a base that moves."""
+    def corrector(self) -> Corrector | None:
+        """What goes on by further QPs, and follows a base that moves; None where C does neither."""
 
     def aim(self, accuracy: Accuracy) -> None:
         """Settle to that `accuracy` from now on."""

@@ -19,9 +19,8 @@ from vgtm_qp.geometry.pairs import Pair
 from vgtm_qp.geometry.watch import Watch
 from vgtm_qp.native import Code
 from vgtm_qp.qp.answer import Accuracy, Move, StepSolution
-from vgtm_qp.qp.fused import FusedWorkspace
 from vgtm_qp.qp.numbers import ClearanceRows
-from vgtm_qp.qp.stepper import Stepper
+from vgtm_qp.qp.stepper import Corrector, Stepper
 from vgtm_qp.step.separation import Separation
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import State
@@ -153,7 +152,7 @@ class Driver:
             or not work.is_ready
             or setup.carrier.carried
             or self._moves != (target.base is not None)
-            or (self._moves and not self._solver.corrects)
+            or (self._moves and self._solver.corrector is None)
             or not target.path.is_straight(target.start, target.end)
         ):
             return None
@@ -175,7 +174,7 @@ class Driver:
         code = self._called(self._arrays.take)
         if not code:
             return self._passage(state, target)
-        if not self._solver.corrects and not (data.settled and code in _SETTLED):
+        if self._solver.corrector is None and not (data.settled and code in _SETTLED):
             return None
         if code in _AGAIN or code == Code.NOT_PROVEN:
             first = self._solver.led(is_settled=bool(data.settled))
@@ -210,13 +209,15 @@ class Driver:
 
     def corrected(self, state: State, target: Target, begun: Begun, code: int) -> Taken:
         """Return the step by further QPs after the first one, which ended with `code`; its beginning if unusual."""
-        first, covered, work = begun.first, 1.0, self._work
-        if code == Code.NOT_PROVEN or not isinstance(work, FusedWorkspace):
+        first, covered, corrector = begun.first, 1.0, self._solver.corrector
+        if code == Code.NOT_PROVEN or corrector is None:
             return begun
         for qps in range(2, MOST_QPS + 1):
             if qps > FREE_QPS and covered == 1.0 and is_cut_short(self._setup, first):
                 covered = first.progress
-                self._cut(work, target.part(covered), first)
+                corrector.go_back(first)
+                self._aim_at(target.part(covered), 1.0)
+                self._arrays.data.settled = 0
             self._solver.draw(state.control_vertices, None)
             code = self._called(self._arrays.correct)
             if code == Code.DONE:
@@ -224,48 +225,37 @@ class Driver:
                 progress = covered * found.progress
                 return Passage(found.state, progress, found.gap, first.solution, begun.rows, qps)
             if code not in _AGAIN:
-                return self._left(work, target, begun, qps, covered, code)
+                return self._left(corrector, target, begun, qps, covered, code)
         return Lost(first.solution, begun.rows)
 
     def _left(
-        self, work: FusedWorkspace, target: Target, begun: Begun, qps: int, covered: float, code: int
+        self, corrector: Corrector, target: Target, begun: Begun, qps: int, covered: float, code: int
     ) -> Begun | Denied:
         """Return what is left to an attempt after QPs of which the last ended with `code`: a proof, or that QP."""
-        first = begun.first
         if code == Code.NOT_PROVEN:
             move = self._solver.led(is_settled=True)
         else:
             # Where the QP before it led, as far as this one knows.
-            q, vertices, progress = (work.inputs[k].copy() for k in (0, 3, 7))
-            torsion = first.torsion if work.curve is None else work.curve.inputs[1].copy()
-            at = q.reshape(work.shape), vertices.reshape(-1, 3), torsion
-            move, qps = Move(first.solution, *at, float(progress[0]), 0.0, None), qps - 1
+            move, qps = Move(begun.first.solution, *corrector.point(), 0.0, None), qps - 1
         begun = begun._replace(move=move, reach=self._arrays.data.reach, qps=qps, covered=covered)
         return _corrects_nothing(target, begun, self._rows()) if code == Code.INFEASIBLE else begun
 
-    def _cut(self, work: FusedWorkspace, target: Target, first: Move) -> None:
-        """Go back to where the `first` answer led, at the end of the `target`."""
-        inputs = work.inputs
-        goal = target.goal(1.0).over(target.end - target.start)
-        work.started[:], work.started_points[:] = first.q.reshape(-1), first.vertices.reshape(-1)
-        work.started_torsions[:] = first.torsion
+    def _aim_at(self, target: Target, progress: float) -> None:
+        """Write the goal at a progress along the `target`."""
+        inputs, goal = self._work.inputs, target.goal(progress).over(target.end - target.start)
         inputs[8][:], inputs[10][:] = goal.position, goal.velocity
         if self._setup.task.turns is not None:
             inputs[9].reshape(3, 3)[:], inputs[11][:] = goal.rotation.T, goal.spin
-        work.gone[0], work.data.reached, self._arrays.data.settled = 0.0, 1.0, 0
 
     def _load(self, state: State, target: Target, share: float) -> None:
         """Write the step's state, goal and boxes."""
         data, inputs, monitor = self._arrays.data, self._work.inputs, self._setup.monitor
-        goal = target.goal(0.0).over(target.end - target.start)
         self._solver.draw(state.control_vertices, target.vertex_goals)
         if self._layout.general is not None:
             self._solver.bend(state.torsion, base_frame(self._setup.arm, target.base))
         self._solver.aim(self._accuracy)
         inputs[4][:], inputs[5][:] = target.lower, target.upper
-        inputs[8][:], inputs[10][:] = goal.position, goal.velocity
-        if self._setup.task.turns is not None:
-            inputs[9].reshape(3, 3)[:], inputs[11][:] = goal.rotation.T, goal.spin
+        self._aim_at(target, 0.0)
         if state is not self._held:
             # What ends the writing half way must not leave a mixture that passes for a state.
             self._held = None

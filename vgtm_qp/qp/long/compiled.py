@@ -137,9 +137,9 @@ class CompiledChain:
         return self
 
     @property
-    def corrects(self) -> bool:
+    def corrector(self) -> None:
         """See :class:`~vgtm_qp.qp.stepper.Stepper`; NumPy may settle what C does not."""
-        return False
+        return None
 
     @property
     def structures(self) -> dict[str, int]:

@@ -11,7 +11,7 @@ from scipy.linalg.lapack import dpotrf, dpotrs, dpstrf
 
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.errors import SolverError
-from vgtm_qp.qp.dense import EQUALITY, DenseSolver
+from vgtm_qp.qp.dense import EQUALITY, DenseQP, DenseSolver
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.long.chain_data import EndRows
 from vgtm_qp.qp.numbers import UNBOUNDED, RowNumbers
@@ -222,7 +222,7 @@ def dual_solution(
         free = np.abs(value) >= UNBOUNDED
         bounds.append(np.where(free, value, (value - values[kept]) * scale))
     sense = np.where(equal[kept], EQUALITY, 0).astype(np.int32)
-    answer = solver.ask(np.eye(rank), np.zeros(rank), rows, bounds[0], bounds[1], sense)
+    answer = solver.ask(DenseQP(np.eye(rank), np.zeros(rank), rows, bounds[0], bounds[1], sense))
     if not answer.is_solved:
         raise SolverError(answer.status)
     multipliers[kept] = answer.multipliers * scale
