@@ -213,6 +213,29 @@ def test_pieces_that_are_gone_are_forgotten_with_their_pairs(rng):
     assert compared > 10
 
 
+@pytest.mark.skipif(compiler() is None, reason="no C compiler")
+def test_a_list_that_is_full_by_chance_is_made_again_where_another_one_needs_room(rng):
+    """There is room for 64 pairs of a shape at first: those with boxes are as many, those of rods 120."""
+    assert building().finish() is not None
+    rods, boxes = np.arange(32).reshape(16, 2), [box(f"box {k}", (k, 0.0, 0.0), 0.1) for k in range(4)]
+    middle = rng.uniform(-1.0, 4.0, (16, 1, 3)) * (1.0, 0.3, 0.3)
+    X = (middle + 0.1 * rng.normal(size=(16, 2, 3))).reshape(-1, 3)
+    watched, listed = (
+        Clearance(capsules(rods, 0.001), boxes, safe=0.01, influence=0.5, watch=watch)
+        for watch in (True, False)
+    )
+    compared = 0
+    for state in walk(X, rng, 8, 0.05):
+        if min(brute_force(watched, state, 0.0).values()) > 0.0:
+            assert watched.watching() is not None
+            compared += compare(watched, listed, state, self_reach=0.5)
+    assert compared > 20
+    assert {pair[2] for pair, distance in brute_force(watched, X, 0.0).items() if distance < 0.5} == {
+        False,
+        True,
+    }
+
+
 @pytest.mark.parametrize("name", ["octahedral", "longeron", "graph"])
 def test_members_that_end_in_offset_joints_are_watched_too(name, rng):
     arm = TrussArm(TRUSSES[name](joint_offset=0.1))

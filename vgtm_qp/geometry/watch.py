@@ -101,10 +101,12 @@ class ListedPairs:
         self._hold(_ROOM)
 
     def _hold(self, room: int) -> None:
-        """Make room for that many pairs; those that were listed are lost."""
+        """Make room for that many pairs; those that were listed are forgotten."""
         self._listed, self._normal = np.zeros(room, dtype=_LISTED), np.zeros((room, 3))
         self._rows, self._contacts = np.zeros(room, dtype=np.int64), np.zeros((2 * room, CONTACT))
         self._program.set(
+            count=0,
+            near=0,
             room=room,
             listed=self._listed,
             normal=self._normal,
@@ -265,9 +267,13 @@ class Watch:
     def make_room(self) -> None:
         """Make more room where there was none for a pair, of bodies or of parts that are near to each other."""
         assert self._way is not None
-        if not any(pairs.make_room() for pairs in self._groups):
-            room = 2 * self._way.data.neighbour_room
-            self._way.set(neighbour=np.zeros(room, dtype=np.int32), neighbour_room=room)
+        larger = next((pairs for pairs in self._groups if pairs.make_room()), None)
+        if larger is not None:
+            # It may have been full by chance, and another one be short.
+            self._way.set(**{"self_far" if larger.is_self else "far": -np.inf})
+            return
+        room = 2 * self._way.data.neighbour_room
+        self._way.set(neighbour=np.zeros(room, dtype=np.int32), neighbour_room=room)
 
     def started(self, X: Array) -> Program:
         """Return the ``Way`` of C, which begins at positions `X` (P, 3)."""

@@ -585,7 +585,8 @@ static int see(Way *w, const double *place, double time, double limit, double se
     int code = DONE;
     if (w->lost) {
         for (int g = 0; g < w->groups; g++) clear(w->group[g]);
-        w->far = w->self_far = -INFINITY;
+        w->far = -INFINITY;
+        w->self_far = w->among ? -INFINITY : INFINITY;
         w->lost = 0;
     }
     w->wanted = fmax(w->wanted, limit);
