@@ -430,7 +430,8 @@ def test_other_threads_may_read_what_is_carried():
         if reads:
             reader.join()
         states.append(resolver.state.nodes)
-    np.testing.assert_array_equal(*states)
+    # Kernels that are compiled meanwhile round in another way.
+    np.testing.assert_allclose(*states, rtol=0.0, atol=1e-12)
 
 
 def test_nearly_round_meshes_are_held_too(tmp_path):
