@@ -13,8 +13,6 @@ import numpy as np
 import pytest
 from hypothesis import is_hypothesis_test, settings
 
-from vgtm_qp.compiled import SELDOM, compile_after
-
 # A shell starts what it runs in the background deaf to interrupts, and programs that tests start would inherit that.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -38,9 +36,6 @@ def pytest_configure(config: pytest.Config) -> None:
         option.seed = getattr(config, "workerinput", {}).get("seed", secrets.randbits(32))
     if option.hypothesis_seed is None:
         option.hypothesis_seed = str(option.seed)
-    if hasattr(config, "workerinput"):
-        # The workers keep all cores busy: a kernel is worth a compiler's time once it is called often.
-        compile_after(SELDOM)
 
 
 @pytest.hookimpl(optionalhook=True)
