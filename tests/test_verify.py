@@ -285,7 +285,7 @@ def test_sparse_and_dense_singular_values_agree(rng) -> None:
     maneuver = maneuver_of(nodes[None], np.zeros(1), truss, status="blocked", reached=0.0)
     arm = RecordedArm(maneuver.manifest["arm"], truss.members)
     dense = arm.singular_values(nodes)
-    assert arm.singular_values(nodes, most_dense=0) == pytest.approx(dense, rel=1e-5)
+    assert arm.singular_values(nodes, most_dense=0) == pytest.approx(dense, rel=1e-8)
 
 
 def offset_joints(rng: np.random.Generator) -> Joints:
