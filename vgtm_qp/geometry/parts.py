@@ -61,39 +61,43 @@ class Parts:
     """
 
     def __init__(self, bodies: Bodies, X: Array, horizon: float) -> None:
-        self._are = Division(bodies, X)
+        self._division = Division(bodies, X)
         self._horizon = self.beyond = horizon
         pairs, gaps = self._pairs(X)
-        every = np.arange(len(self._are))
+        every = np.arange(len(self._division))
         self.near = np.concatenate([np.stack([every, every], axis=1), pairs[gaps < horizon]])
         self._codes = self._codes_of(*self.near.T)
 
     def among(self, chosen: Mask, first: Index, second: Index) -> Mask:
         """Return (K,) which pairs of bodies are in the pairs of parts that `chosen` picks from `near`."""
-        return np.isin(self._codes_of(self._are.of[first], self._are.of[second]), self._codes[chosen])
+        return np.isin(
+            self._codes_of(self._division.of[first], self._division.of[second]), self._codes[chosen]
+        )
 
     def _codes_of(self, first: Index, second: Index) -> Index:
         """Return (K,) a number for each pair of parts, the same in either order."""
-        return np.asarray(np.minimum(first, second) * len(self._are) + np.maximum(first, second))
+        return np.asarray(np.minimum(first, second) * len(self._division) + np.maximum(first, second))
 
     def inside(self, parts: Index) -> tuple[Index, Index]:
         """Return the bodies of some parts, and the points that span these."""
-        are = self._are
-        return np.flatnonzero(np.isin(are.of, parts)), np.unique(are.points[np.isin(are.part, parts)])
+        division = self._division
+        return np.flatnonzero(np.isin(division.of, parts)), np.unique(
+            division.points[np.isin(division.part, parts)]
+        )
 
     def _balls(self, vectors: Array) -> tuple[Array, Array]:
         """Return centers (K, 3) and radii (K,) of balls round the vectors (P, 3) of the points of each part."""
-        are = self._are
-        own, starts = vectors.take(are.points, axis=0), are.points_at[:-1]
-        center = np.add.reduceat(own, starts, axis=0) / np.diff(are.points_at)[:, None]
-        own -= center.take(are.part, axis=0)
+        division = self._division
+        own, starts = vectors.take(division.points, axis=0), division.points_at[:-1]
+        center = np.add.reduceat(own, starts, axis=0) / np.diff(division.points_at)[:, None]
+        own -= center.take(division.part, axis=0)
         square = np.maximum.reduceat(np.einsum("kc,kc->k", own, own), starts)
         return center, np.sqrt(square)
 
     def _pairs(self, X: Array) -> tuple[Index, Array]:
         """Return pairs of parts (K, 2), among them all nearer than the horizon at `X`, and their distances (K,), m."""
         center, radius = self._balls(X)
-        radius += self._are.thickness
+        radius += self._division.thickness
         reach = 2.0 * float(radius.max()) + self._horizon
         pairs = cKDTree(center).query_pairs(reach, output_type="ndarray").astype(np.int64)
         first, second = pairs.T

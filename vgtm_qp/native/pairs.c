@@ -240,8 +240,8 @@ static void measure_parts(Way *w)
     w->parted = least;
 }
 
-/* List a pair that may be nearer than the horizon: of a body, and of another one or a piece with these axes, which are
-   further apart than the sum of their radii, `thick`, and a bound along the line between their middles. */
+/* List the pair of a body and another one, or a piece, whose axis (7) is `second`, if the plane across the line between
+   their middles does not hold them apart by the horizon; `thick` is the sum of their radii. */
 static int list_if_near(const Way *w, Pairs *p, int body, int other, const double *second, double thick, double horizon)
 {
     const double *first = w->axis + AXIS * body;

@@ -67,8 +67,9 @@ typedef struct {
     double *places;                        /* (MOST_PIECES + 1, P, 3) */
 
     /* Rows of clearance: their contacts (R, 9), numbers of group and pair, in which round they were asked for, 0 in none,
-       and body, other and whether that is a body (R, 3); middle and span of the body and of the other body (R, 12), and the answer (R, 7): a distance, a point of the
-       body and one of the other. Counts of rounds, of rows asked for, and of answers that were proven. */
+       and body, other and whether that is a body (R, 3); middle and span of the body and of the other body (R, 12), and
+       the answer (R, 7): a distance, a point of the body and one of the other. Counts of rounds, of rows asked for, and
+       of answers that were proven. */
     int room, round, asked_for, proven;
     double *contacts, *questions, *answers;
     int *group, *pair, *asked, *named;
@@ -448,15 +449,16 @@ static int pass(StepData *s, int pieces, double spare)
     w->end = s->next_time;
     w->floor = s->safe + spare;
     w->self_floor = fmax(s->self_safe + spare, 0.0);
-    return prove_path(w);
+    code = prove_path(w);
+    /* The QP is not to be solved once more for want of room: another proof makes some. */
+    return code == FULL ? NOT_PROVEN : code;
 }
 
 /* Whether the next state, the way to which is proven or not, as `code` says, keeps all clearances itself. */
 static int judge(StepData *s, int code)
 {
     if (code && code != NOT_PROVEN) return code;
-    int other = code ? see(s->way, s->next_points, s->next_time, s->safe, s->self_safe) : DONE;
-    if (other) return other == FULL ? FULL : NOT_PROVEN;
+    if (code && see(s->way, s->next_points, s->next_time, s->safe, s->self_safe)) return NOT_PROVEN;
     return is_clear(s) ? code : TOO_NEAR;
 }
 
