@@ -91,6 +91,15 @@ def test_they_give_what_the_curve_itself_gives(shape, rng):
     assert taken >= 4
 
 
+def test_a_bend_that_is_too_sharp_for_the_cells_is_not_said_to_be_right():
+    """Found by the test above: the speed is smooth in every cell, and the roll's rows were 3e-10 off."""
+    shape = CurveShape(b_spline(7, 3), NODES, roll=np.array([0.1, -0.3, 2.0, 0.0]), tracks_roll=True)
+    random = np.random.default_rng([1884783496, 4086071276])
+    asked = [bent(shape, random, bend) for bend in [0.02] * 4 + [0.1] * 4 + [0.3] * 2]
+    right = [found(curve_function(shape), one)[1] for one in asked]
+    assert right == [True] * 8 + [False, True]
+
+
 @pytest.mark.parametrize("shape", shapes())
 def test_the_rows_are_the_derivatives_of_nodes_frames_and_spacings(shape, rng):
     check_curve_rows(shape, *bent(shape, rng, 0.03), atol=1e-6, turn_atol=1e-5)

@@ -25,6 +25,9 @@ _SMOOTH = 3e-6
 """Greatest part of degree 6 or 7 of the speed in a cell, over its mean: 8 Gauss points then leave errors of 1e-13,
 seldom of 1e-11."""
 
+_STEADY = 3e-4
+"""The same of kappa b, over its greatest magnitude: its integrals have errors of 1e-12 then, 1e-10 at ten times that."""
+
 _EVEN = 0.5
 """Least speed in a cell, over its mean."""
 
@@ -172,6 +175,14 @@ class _CurveGraph:
         self._sound.append(ca.mmin(speeds / _rows(mean, len(self._nodes))) > _EVEN)
         return speeds
 
+    def _check_bends(self) -> None:
+        """Have kappa b, whose integrals the rows of the roll are, smooth in each cell, as its speed is."""
+        first, second = self._tables
+        bends = _binormal().map(first.shape[1])(self._vertices @ first, self._vertices @ second)
+        parts = ca.DM(_finest_parts(self._nodes, self._weights)) @ ca.reshape(bends.T, len(self._nodes), -1)
+        scale = ca.mmax(ca.fabs(bends)) + _NO_STEP
+        self._sound.append(ca.mmax(ca.fabs(parts)) / scale < _STEADY)
+
     def _located(self, fractions: ca.MX) -> ca.MX:
         """Return (1, K) the parameters at these fractions of the arc length: Newton's method within a cell."""
         lengths = (ca.DM(self._weights).T @ self._speeds) * self._widths
@@ -295,6 +306,7 @@ class _CurveGraph:
             assert self._speeds.shape[0]
             integrals = self._integrals()
         if shape.tracks_roll:
+            self._check_bends()
             normal, start, speed = self._start
             swept = ca.cross(start, normal) / ((1.0 + ca.dot(normal, start)) * speed)
             at_base = self._constants.add("base_slopes", shape.family.weights(0.0, 1))
