@@ -26,7 +26,7 @@ _SMOOTH = 3e-6
 seldom of 1e-11."""
 
 _STEADY = 3e-4
-"""The same of kappa b, over its greatest magnitude: its integrals have errors of 1e-12 then, 1e-10 at ten times that."""
+"""The same of kappa b over its greatest magnitude: its integrals have errors of 1e-12 then; 1e-10 at ten times that."""
 
 _EVEN = 0.5
 """Least speed in a cell, over its mean."""
