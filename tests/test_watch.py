@@ -195,21 +195,24 @@ def test_contacts_are_the_same_whichever_way_they_are_found(fastest, rng):
 def test_pieces_that_are_gone_are_forgotten_with_their_pairs(rng):
     """Many balls, then few and none; the way goes on before anything is listed anew."""
     assert building().finish() is not None
-    X, watched = scene(rng)
-    place, compared = X, 0
-    for count in (60, 2, 30, 0, 1, 20):
-        balls = [
-            sphere(f"ball {k}", rng.uniform(-2.0, 2.0, 3), 0.1, 0.1 * rng.normal(size=3))
-            for k in range(count)
-        ]
-        watched.put(balls)
-        listed = Clearance(capsules(MEMBERS, 0.03), balls, safe=0.08, influence=0.5, watch=False)
-        for k, state in enumerate(walk(place, rng, 4, 0.05)[1:]):
-            assert watched.watching() is not None
-            watched.along(np.stack([place, state]), 0.1 * k, 0.1 * (k + 1), -1.0, -1.0, thorough=False)
-            place = state
-            if not min(distance for distance in brute_force(watched, state, 0.1 * (k + 1)).values()) <= 0.0:
-                compared += compare(watched, listed, state, time=0.1 * (k + 1), self_reach=0.3)
+    compared = 0
+    for _ in range(3):
+        place, watched = scene(rng)
+        while min(distance for pair, distance in brute_force(watched, place, 0.0).items() if pair[2]) < 0.05:
+            place, watched = scene(rng)
+        for count in (60, 2, 30, 0, 1, 20):
+            balls = [
+                sphere(f"ball {k}", rng.uniform(-2.0, 2.0, 3), 0.1, 0.1 * rng.normal(size=3))
+                for k in range(count)
+            ]
+            watched.put(balls)
+            listed = Clearance(capsules(MEMBERS, 0.03), balls, safe=0.08, influence=0.5, watch=False)
+            for k, state in enumerate(walk(place, rng, 4, 0.02)[1:]):
+                assert watched.watching() is not None
+                watched.along(np.stack([place, state]), 0.1 * k, 0.1 * (k + 1), -1.0, -1.0, thorough=False)
+                place = state
+                if min(brute_force(watched, state, 0.1 * (k + 1)).values()) > 0.0:
+                    compared += compare(watched, listed, state, time=0.1 * (k + 1), self_reach=0.3)
     assert compared > 10
 
 
