@@ -47,6 +47,7 @@ from vgtm_qp.qp.stepper import NearRows
 from vgtm_qp.rows.tip import TipGoal
 
 _NOWHERE: Array = np.zeros((0, 3))
+_NO_NUMBERS: Array = np.zeros(0)
 _LIBRARIES = (".so", ".dylib", ".dll")
 
 _ROOM, _SLOTS = 24, 4
@@ -228,16 +229,17 @@ class FusedSolver:
     def _solution(self, x: Array, near: int, nodes: Array, vertices: Array) -> StepSolution:
         work, x = self.workspace, x.copy()
         count, first = work.actuators, work.size + work.first_near
+        pull = work.multipliers
         return record(
             StepSolution,
             nodes=nodes,
             actuators=x[:count],
             vertices=vertices,
-            progress=float(x[-1]),
-            actuator_multipliers=work.multipliers[:count].copy(),
-            clearance_multipliers=-work.multipliers[first : first + near],
+            progress=x.item(-1),
+            actuator_multipliers=pull[:count].copy(),
+            clearance_multipliers=-pull[first : first + near] if near else _NO_NUMBERS,
             iterations=work.data.iterations,
-            torsion=x[work.torsion : -1],
+            torsion=x[work.torsion : -1] if self.layout.torsion else _NO_NUMBERS,
             tip_slack=0.0,
         )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,31 +25,25 @@ def braking_speed(distance: Array, acceleration: Array, dt: float) -> Array:
     return np.asarray(np.where(np.isfinite(acceleration) & np.isfinite(gap), speed, np.inf))
 
 
-_DOWN_AND_UP = np.array([[-1.0], [1.0]])
-
 APPROACH = 0.3
 """Largest share of the distance to the end of its stroke that an actuator that slows down uses in one step."""
 
 
-def resting_box(
-    value: Array, ends: Array, travel: Array, least_approach: Array | None
-) -> tuple[Array, Array]:
-    """Return the box of :func:`actuator_box` for actuators without limits of their acceleration.
+def resting_box(count: int) -> ca.Function:
+    """Return :func:`actuator_box` of actuators without limits of their acceleration, all (n_a,).
 
-    Parameters
-    ----------
-    ends : (2, n_a)
-        The least values of the stroke times -1, and the greatest.
-    travel : (n_a,)
-        Greatest changes by the rate.
-    least_approach : (n_a,)
-        Approach to an end of the stroke that is always allowed; the actuators slow down before that. None if they do
-        not.
+    Arguments: values, least and greatest ones of the strokes, greatest changes by the rate, and the approach to an end
+    of the stroke that is always allowed: before that the actuators slow down; inf if they do not.
     """
-    left = np.maximum(ends - _DOWN_AND_UP * value, 0.0)
-    near = left if least_approach is None else np.maximum(APPROACH * left, np.minimum(left, least_approach))
-    lower, upper = value + _DOWN_AND_UP * np.minimum(near, travel)
-    return lower, upper
+    names = "value", "least", "greatest", "travel", "approach"
+    value, least, greatest, travel, approach = arguments = [ca.MX.sym(name, count) for name in names]
+
+    def change(left: ca.MX) -> ca.MX:
+        left = ca.fmax(left, 0.0)
+        return ca.fmin(ca.fmax(APPROACH * left, ca.fmin(left, approach)), travel)
+
+    box = [value - change(value - least), value + change(greatest - value)]
+    return ca.Function("resting_box", arguments, box, list(names), ["lower", "upper"])
 
 
 def actuator_box(

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.arrays import Array
+from vgtm_qp.compiled import Kernel
 from vgtm_qp.errors import GoalError, nearest
 from vgtm_qp.qp.settle import enough_length
 from vgtm_qp.rows.limits import actuator_box, binding, resting_box
@@ -88,8 +89,9 @@ class Actuation:
         arm = setup.arm
         self._arm, self._actuators = arm, arm.actuators
         self.names = tuple(arm.quantity_names[k] for k in arm.actuators)
-        self._stroke, self._rate = arm.stroke[arm.actuators], arm.rate[arm.actuators]
-        self._acceleration = arm.acceleration[arm.actuators]
+        self._resting = Kernel(resting_box(len(arm.actuators)), compiled=False)
+        self._set_stroke(arm.stroke[arm.actuators])
+        self._rate, self._acceleration = arm.rate[arm.actuators], arm.acceleration[arm.actuators]
         self.starts_at_once = bool(np.isinf(self._acceleration).all())
         # An error of a length, divided twice by the time, is an error of an acceleration: so it is kept near
         # rounding.
@@ -98,7 +100,6 @@ class Actuation:
         self._settled = enough_length(arm.home_configuration, self.tolerance)
         self._slows_down = setup.slows_down and self.starts_at_once
         self._least_approach = _LEAST_APPROACH * arm.unit / arm.levers
-        self._ends = _ends(self._stroke)
         self._pace: tuple[float, Array, Array] = 0.0, self._rate, self._rate
         self.locked: set[str] = set()
         self._held = np.zeros(len(self.names), dtype=bool)
@@ -123,9 +124,9 @@ class Actuation:
             raise GoalError(f'cannot lock "{name}", which {what}; actuators are {names}{hint}')
         k = self.names.index(name)
         # New arrays: the limits of earlier steps keep theirs.
-        self._stroke, self._held = self._stroke.copy(), self._held.copy()
-        self._stroke[k] = self.values(state)[k]
-        self._ends = _ends(self._stroke)
+        stroke, self._held = self._stroke.copy(), self._held.copy()
+        stroke[k] = self.values(state)[k]
+        self._set_stroke(stroke)
         self._held[k] = True
         self.locked.add(name)
 
@@ -153,8 +154,8 @@ class Actuation:
         """
         value, stroke, (_, rate, travel) = self.values(state), self._stroke, self._paced(dt)
         if self.starts_at_once:
-            least = self._least_approach if slowing and self._slows_down else None
-            lower, upper = resting_box(value, self._ends, travel, least)
+            approach = self._least_approach if slowing and self._slows_down else np.inf
+            lower, upper = self._resting_box(value, travel, approach)
         else:
             limits = stroke, rate, self._acceleration, dt, state.duration or None
             lower, upper = actuator_box(value, state.rates.take(self._actuators), *limits)
@@ -166,6 +167,17 @@ class Actuation:
         lower, upper = np.maximum(box[0], value - reach), np.minimum(box[1], value + reach)
         return (lower, upper) if np.all(lower <= upper) else None
 
+    def _set_stroke(self, stroke: Array) -> None:
+        self._stroke = stroke
+        self._resting.inputs[1][:], self._resting.inputs[2][:] = stroke[:, 0], stroke[:, 1]
+
+    def _resting_box(self, value: Array, travel: Array, approach: Array | float) -> Box:
+        inputs = self._resting.inputs
+        inputs[0][:], inputs[3][:], inputs[4][:] = value, travel, approach
+        self._resting()
+        lower, upper = self._resting.outputs
+        return lower.copy(), upper.copy()
+
     def _paced(self, dt: float) -> tuple[float, Array, Array]:
         """Return `dt`, s, the greatest rates (n_a,) of such a step, less what settling may add, and their changes."""
         if dt != self._pace[0]:
@@ -174,8 +186,3 @@ class Actuation:
             rate = np.maximum(self._rate - np.maximum(spare, self._settled / dt), 0.0)
             self._pace = dt, rate, rate * dt
         return self._pace
-
-
-def _ends(stroke: Array) -> Array:
-    """Return (2, n_a) the least values of strokes (n_a, 2) times -1, and the greatest."""
-    return np.stack([-stroke[:, 0], stroke[:, 1]])

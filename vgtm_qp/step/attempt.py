@@ -12,7 +12,7 @@ import numpy as np
 
 from vgtm_qp.arrays import Array, record
 from vgtm_qp.errors import CurveError, EvaluationError, SolverError
-from vgtm_qp.qp.answer import Accuracy, Closed, Move
+from vgtm_qp.qp.answer import Accuracy, Closed, Move, StepSolution
 from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.qp.residual import CONTRADICTION, AnswerError, FailedStepError, InfeasibleStepError
 from vgtm_qp.rows.tip import TipGoal
@@ -23,9 +23,9 @@ from vgtm_qp.step.driver import (
     MOST_QPS,
     PHASES,
     Begun,
-    Denied,
     Driver,
     Lost,
+    Passage,
     can_drive,
     is_cut_short,
 )
@@ -205,15 +205,15 @@ class Attempt:
             return taken
         qps = MOST_QPS if isinstance(taken, Lost) else taken.qps
         self.qps += qps
+        if isinstance(taken, Passage):
+            return self._accepted(taken.state, taken.progress, taken.gap, qps, taken.solution, taken.rows)
         of_qps: dict[str, Any] = {"qps": qps, "solution": taken.solution, "rows": taken.rows}
         if isinstance(taken, Lost):
             return Step(StepStatus.BLOCKED, 0.0, state, _NO_CONVERGENCE, **of_qps)
-        if isinstance(taken, Denied):
-            asked, error = taken.asked, InfeasibleStepError(CONTRADICTION)
-            error.build = lambda: engine.qp(asked)
-            reason, failure, _ = _reason(error)
-            return Step(StepStatus.BLOCKED, 0.0, state, reason, failure=failure, **of_qps)
-        return self._accepted(taken.state, taken.progress, taken.gap, **of_qps)
+        asked, error = taken.asked, InfeasibleStepError(CONTRADICTION)
+        error.build = lambda: engine.qp(asked)
+        reason, failure, _ = _reason(error)
+        return Step(StepStatus.BLOCKED, 0.0, state, reason, failure=failure, **of_qps)
 
     def _recovery(self, short: Shortfall) -> float:
         """Return the distance by which pairs that are too near are driven apart, m."""
@@ -328,7 +328,7 @@ class Attempt:
             if report.certified:
                 then = state.next(self._arm, target.duration, closed, vertices, move.torsion, after)
                 progress = covered * move.progress
-                return self._accepted(then, progress, gap, qps=count, solution=first.solution, rows=rows)
+                return self._accepted(then, progress, gap, count, first.solution, rows)
             fractions.extend(s for s in report.failing_parameters() if s not in fractions)
             if len(fractions) > _MOST_FRACTIONS:
                 return blocked("clearance between the states")
@@ -353,11 +353,28 @@ class Attempt:
             return "the arm turns too far in one step"
         return self._too_long(self._arm.nodes(q) - state.nodes) if self._has_limit else ""
 
-    def _accepted(self, state: State, progress: float, gap: float, **of_qps: Any) -> Step:
-        """Return the step to a proven `state` with the `gap` of its stations; `of_qps` are its fields of the QPs."""
-        status = StepStatus.REACHED if progress >= WHOLE else StepStatus.SLOWED
-        known = {"status": status, "progress": progress, "state": state, "reason": "", "gap": gap, **of_qps}
-        return record(Step, gave_way=self._gave_way(gap), **known)
+    def _accepted(
+        self,
+        state: State,
+        progress: float,
+        gap: float,
+        qps: int,
+        solution: StepSolution | None,
+        rows: ClearanceRows | None,
+    ) -> Step:
+        """Return the step to a proven `state` with the `gap` of its stations, and its fields of the QPs."""
+        return record(
+            Step,
+            status=StepStatus.REACHED if progress >= WHOLE else StepStatus.SLOWED,
+            progress=progress,
+            state=state,
+            reason="",
+            qps=qps,
+            gave_way=self._gave_way(gap),
+            gap=gap,
+            solution=solution,
+            rows=rows,
+        )
 
     def _flaw(self, state: State, target: Target, move: Move, closed: Closed) -> str:
         """Return the flaw of the configuration of a `move` from `state`, computed again, or nothing."""

@@ -214,7 +214,7 @@ class Resolver(ChangingScene):
             The goal is not three finite numbers, has a coordinate that is not tracked or the direction twice,
             or `dt` is not a positive number; the state is unchanged.
         """
-        path = self.setup.task.path_to(self.tip(), position, pointing, rotation_vector)
+        path = self.setup.task.path_to(self._tip(), position, pointing, rotation_vector)
         return self.follow(path, 0.0, 1.0, dt=dt)
 
     def build(
@@ -234,11 +234,17 @@ class Resolver(ChangingScene):
 
     def tip(self) -> tuple[Array, Array]:
         """Return position (3,), m, and rotation (3, 3) of the end effector in the present state."""
+        position, rotation = self._tip()
+        return position.copy(), rotation.copy()
+
+    def _tip(self) -> Pose:
         if (known := self.state.tip) is not None:
-            return known.position.copy(), known.rotation.copy()
+            return known
         with self._lock:
             self.setup.kinematics.evaluate_tip(nodes := self.state.nodes)
-            return self.setup.arm.end_effector.position(nodes), self.setup.kinematics.tip_rotation.copy()
+            return Pose(
+                self.setup.arm.end_effector.position(nodes), self.setup.kinematics.tip_rotation.copy()
+            )
 
     def follow(self, path: Path, start: float, end: float, *, dt: float | None = None) -> Step:
         """Move along `path` from its value `start` towards `end` in one step of `dt`, s, by default the problem's.
