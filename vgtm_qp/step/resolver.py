@@ -214,7 +214,7 @@ class Resolver(ChangingScene):
             The goal is not three finite numbers, has a coordinate that is not tracked or the direction twice,
             or `dt` is not a positive number; the state is unchanged.
         """
-        path = self.setup.task.path_to(self._tip(), position, pointing, rotation_vector)
+        path = self.setup.task.path_to(self.state.tip or self.tip(), position, pointing, rotation_vector)
         return self.follow(path, 0.0, 1.0, dt=dt)
 
     def build(
