@@ -234,17 +234,11 @@ class Resolver(ChangingScene):
 
     def tip(self) -> tuple[Array, Array]:
         """Return position (3,), m, and rotation (3, 3) of the end effector in the present state."""
-        position, rotation = self._tip()
-        return position.copy(), rotation.copy()
-
-    def _tip(self) -> Pose:
         if (known := self.state.tip) is not None:
-            return known
+            return known.position.copy(), known.rotation.copy()
         with self._lock:
             self.setup.kinematics.evaluate_tip(nodes := self.state.nodes)
-            return Pose(
-                self.setup.arm.end_effector.position(nodes), self.setup.kinematics.tip_rotation.copy()
-            )
+            return self.setup.arm.end_effector.position(nodes), self.setup.kinematics.tip_rotation.copy()
 
     def follow(self, path: Path, start: float, end: float, *, dt: float | None = None) -> Step:
         """Move along `path` from its value `start` towards `end` in one step of `dt`, s, by default the problem's.
