@@ -145,7 +145,7 @@ def test_bounds_of_frames_of_any_polygon_hold(corners, size, rng):
     angle = 2.0 * np.pi * np.arange(corners) / corners
     ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(corners)], axis=1)
     home = ring + 0.1 * rng.normal(size=ring.shape)
-    cosines, sines, alignment = frame_constants(home, np.eye(3))
+    (cosines,), (sines,), (alignment,) = frame_constants(home[None], np.eye(3)[None])
     frame, bound = frame_function(corners), frame_deviation(corners)
     own = SimpleNamespace(tip=np.arange(corners), _tip_fit=polygon_frame(home, None))
     for _ in range(10):

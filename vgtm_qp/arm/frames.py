@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from itertools import pairwise
 
 import casadi as ca
@@ -53,6 +54,7 @@ def frames_along(points: Array) -> Array:
     return np.stack(frames)
 
 
+@cache
 def frame_function(count: int) -> ca.Function:
     """Return (nodes (3, K), cosines, sines, alignment) -> rotation R (3, 3) and spin S (3, 3K), dR = [S d nodes]x R."""
     nodes, cosines, sines = (
@@ -66,24 +68,26 @@ def frame_function(count: int) -> ca.Function:
     return ca.Function("frame", [nodes, cosines, sines, alignment], [fitted @ alignment, ca.densify(spin)])
 
 
-def frame_constants(home: Array, rotation: Array) -> tuple[Array, Array, Array]:
-    """Return the polar angles' cosines and sines, and the alignment that makes the frame at `home` equal `rotation`."""
-    centred = home - home.mean(axis=0)
-    normal = np.sum(np.cross(centred, np.roll(centred, -1, axis=0)), axis=0)
-    normal /= np.linalg.norm(normal)
-    first = rotation[:, 0] - normal * (normal @ rotation[:, 0])
-    if np.linalg.norm(first) < 1e-6:
-        first = centred[0]
-    first = first / np.linalg.norm(first)
-    second = np.cross(normal, first)
-    angles = np.arctan2(centred @ second, centred @ first)
-    return np.cos(angles), np.sin(angles), np.stack([first, second, normal], axis=0) @ rotation
+def frame_constants(home: Array, rotations: Array) -> tuple[Array, Array, Array]:
+    """Return the constants of F frames of :func:`frame_function` which have the `rotations` (F, 3, 3) at home.
+
+    Cosines and sines (F, K) of the polar angles of the nodes at `home` (F, K, 3), and the alignments (F, 3, 3).
+    """
+    centred = home - home.mean(axis=1, keepdims=True)
+    normal = np.cross(centred, np.roll(centred, -1, axis=1)).sum(axis=1)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    x = rotations[:, :, 0]
+    first = x - normal * np.sum(normal * x, axis=1, keepdims=True)
+    first = np.where(np.linalg.norm(first, axis=1, keepdims=True) < 1e-6, centred[:, 0], first)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    axes = np.stack([first, np.cross(normal, first), normal], axis=1)
+    angles = np.arctan2(*(np.einsum("fkc,fc->fk", centred, axes[:, axis]) for axis in (1, 0)))
+    return np.cos(angles), np.sin(angles), axes @ rotations
 
 
 def frame_tables(home: Array, rotations: Array) -> tuple[Array, Array, Array]:
-    """Return `frame_constants` of F frames as rows: cosines and sines (F, K), and the alignments' columns (3 F, 3)."""
-    constants = [frame_constants(points, rotation) for points, rotation in zip(home, rotations, strict=True)]
-    cosines, sines, alignments = (np.stack(column) for column in zip(*constants, strict=True))
+    """Return :func:`frame_constants` as rows: cosines and sines (F, K), and the alignments' columns (3 F, 3)."""
+    cosines, sines, alignments = frame_constants(home, rotations)
     return cosines, sines, alignments.transpose(0, 2, 1).reshape(-1, 3)
 
 

@@ -185,7 +185,9 @@ class TrussArm(Arm):
     def _tip_turning(self) -> Kernel:
         tip = self.end_effector
         kernel = Kernel(frame_deviation(len(tip.nodes)), compiled=False)
-        kernel.inputs[2][:], kernel.inputs[3][:], _ = frame_constants(self.home[tip.nodes], tip.frame)
+        kernel.inputs[2][:], kernel.inputs[3][:], _ = frame_constants(
+            self.home[tip.nodes][None], tip.frame[None]
+        )
         return kernel
 
     def symbols(self, constants: Constants) -> TrussSymbols:

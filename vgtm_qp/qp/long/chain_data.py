@@ -324,13 +324,14 @@ def frame_constants_of(chain: Chain, data: ChainData) -> tuple[Array, Array]:
 
     A station with its nodes in clockwise order has y- and z-axis of its fitted frame reversed.
     """
-    arm, angles, alignments = chain.layout.arm, [], []
-    for station, order in zip(
-        chain.layout.tracked[data.stations].tolist(), data.station_order.reshape(-1, 3), strict=True
-    ):
-        home, frame = arm.home[arm.stations.nodes[station]], arm.stations.frames[station]
-        cosines, sines, alignment = frame_constants(home, frame)
-        sense = 1.0 if (np.roll(order, -int(order.argmin())) == np.arange(3)).all() else -1.0
-        angles.append(np.concatenate([cosines[order], sense * sines[order]]))
-        alignments.append((np.array([1.0, sense, sense])[:, None] * alignment).T)
-    return np.array(angles), np.array(alignments)
+    arm, order = chain.layout.arm, data.station_order.reshape(-1, 3)
+    stations = chain.layout.tracked[data.stations]
+    cosines, sines, alignments = frame_constants(
+        arm.home[arm.stations.nodes[stations]], arm.stations.frames[stations]
+    )
+    first = order.argmin(axis=1)[:, None]
+    turned = np.take_along_axis(order, (first + np.arange(3)) % 3, axis=1)
+    sense = np.where((turned == np.arange(3)).all(axis=1), 1.0, -1.0)[:, None]
+    angles = [np.take_along_axis(angle, order, axis=1) for angle in (cosines, sense * sines)]
+    reversed_axes = np.concatenate([np.ones_like(sense), sense, sense], axis=1)[:, :, None]
+    return np.concatenate(angles, axis=1), (reversed_axes * alignments).transpose(0, 2, 1)
