@@ -1,4 +1,4 @@
-"""Settings of all tests: how many processes run them, and what they draw at random."""
+"""Settings of all tests: how many processes run them, which ones, and what they draw at random."""
 
 import os
 import secrets
@@ -25,6 +25,13 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     """Add the option that repeats the random cases of a run."""
     parser.addoption(
         "--seed", type=int, metavar="N", help="Draw the random cases of seed N, which an earlier run has told"
+    )
+    parser.addoption(
+        "--one-in",
+        type=int,
+        default=1,
+        metavar="N",
+        help="Of the tests that draw random cases take one in N; the seed chooses which",
     )
 
 
@@ -67,11 +74,20 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
 
 
 @pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests that draw new cases in each run, for ``-m property``."""
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Mark the tests that draw new cases in each run, for ``-m property``, and leave out those not chosen."""
     for item in items:
         if isinstance(item, pytest.Function) and (is_hypothesis_test(item.obj) or "rng" in item.fixturenames):
             item.add_marker("property")
+    if config.option.one_in > 1:
+        left_out = [item for item in items if item.get_closest_marker("property") and not is_chosen(item)]
+        config.hook.pytest_deselected(items=left_out)
+        items[:] = [item for item in items if item not in set(left_out)]
+
+
+def is_chosen(item: pytest.Item) -> bool:
+    option = item.config.option
+    return (zlib.crc32(item.nodeid.encode()) + option.seed) % option.one_in == 0
 
 
 @pytest.fixture
