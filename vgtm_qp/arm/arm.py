@@ -514,8 +514,7 @@ class Kinematics:
         motion, _ = symbols.motion(q, q, ca.MX.zeros(*X.shape))
         outputs = [symbols.quantities(q), motion, ca.MX.eye(3), ca.MX.zeros(3, 3 * len(tip.nodes))]
         if tip.has_frame:
-            frame = Frames(arm.home[tip.nodes][None], tip.frame[None], tip.nodes[None], constants, "tip")
-            outputs[2:] = frame.at(X)
+            outputs[2:] = tip_frames(arm, constants).at(X)
         if stations:
             at_home = arm.home[stations.nodes]
             outputs += Frames(at_home, stations.frames, stations.nodes, constants, "station").at(X)
@@ -561,9 +560,16 @@ class Kinematics:
 def tip_function(arm: Arm) -> Bound:
     """Return the function from the tip's nodes (3, K) to its rotation (3, 3) and spin (3, 3K); the tip has a frame."""
     constants, tip = Constants(), arm.end_effector
-    nodes, own = ca.MX.sym("nodes", 3, len(tip.nodes)), np.arange(len(tip.nodes))[None]
-    frame = Frames(arm.home[tip.nodes][None], tip.frame[None], own, constants, "tip")
+    nodes = ca.MX.sym("nodes", 3, len(tip.nodes))
+    frame = tip_frames(arm, constants, np.arange(len(tip.nodes)))
     return constants.bound("tip_frame", [nodes], list(frame.at(nodes)))
+
+
+def tip_frames(arm: Arm, constants: Constants, columns: Index | None = None) -> Frames:
+    """Return the end effector's frame; `columns` (K,) are those of its nodes among positions, if not all nodes have one."""
+    tip = arm.end_effector
+    among = tip.nodes if columns is None else columns
+    return Frames(arm.home[tip.nodes][None], tip.frame[None], among[None], constants, "tip")
 
 
 def between(start: Array, end: Array, pieces: int) -> Array:

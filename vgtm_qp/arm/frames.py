@@ -54,18 +54,25 @@ def frames_along(points: Array) -> Array:
     return np.stack(frames)
 
 
+def _polygon(count: int) -> tuple[ca.SX, list[ca.SX], ca.SX, ca.SX]:
+    """Return symbols: K nodes (3, K), cosines and sines of polar angles, the rotation fitted to them, an alignment."""
+    nodes, angles = ca.SX.sym("nodes", 3, count), [ca.SX.sym(name, count) for name in ("cosines", "sines")]
+    return nodes, angles, fitted_frame(nodes, *angles), ca.SX.sym("alignment", 3, 3)
+
+
+@cache
+def rotation_function(count: int) -> ca.Function:
+    """Return (nodes (3, K), cosines, sines, alignment) -> rotation R (3, 3)."""
+    nodes, angles, fitted, alignment = _polygon(count)
+    return ca.Function("rotation", [nodes, *angles, alignment], [fitted @ alignment])
+
+
 @cache
 def frame_function(count: int) -> ca.Function:
     """Return (nodes (3, K), cosines, sines, alignment) -> rotation R (3, 3) and spin S (3, 3K), dR = [S d nodes]x R."""
-    nodes, cosines, sines = (
-        ca.SX.sym("nodes", 3, count),
-        ca.SX.sym("cosines", count),
-        ca.SX.sym("sines", count),
-    )
-    alignment = ca.SX.sym("alignment", 3, 3)
-    fitted = fitted_frame(nodes, cosines, sines)
+    nodes, angles, fitted, alignment = _polygon(count)
     spin = turning(fitted, nodes, ca.SX.eye(3))
-    return ca.Function("frame", [nodes, cosines, sines, alignment], [fitted @ alignment, ca.densify(spin)])
+    return ca.Function("frame", [nodes, *angles, alignment], [fitted @ alignment, ca.densify(spin)])
 
 
 def frame_constants(home: Array, rotations: Array) -> tuple[Array, Array, Array]:

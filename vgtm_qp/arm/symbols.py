@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
-from vgtm_qp.arm.frames import frame_function, frame_tables
+from vgtm_qp.arm.frames import frame_function, frame_tables, rotation_function
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.compiled import Compiling, Kernel
 
@@ -60,12 +60,21 @@ class Frames:
         tables = zip(names, frame_tables(home, rotations), strict=True)
         self._arguments = [constants.add(name, table) for name, table in tables]
         self._columns = nodes.reshape(-1).tolist()
-        self._function = frame_function(home.shape[1]).map(len(home))
+        self._shape = home.shape
 
     def at(self, X: ca.MX) -> tuple[ca.MX, ca.MX]:
         """Return rotations (3, 3F) and spins (3, 3KF) at positions (3, N)."""
-        rotation, spin = self._function(X[:, self._columns], *self._arguments)
+        rotation, spin = self._of_each(frame_function, X)
         return rotation, spin
+
+    def rotations(self, X: ca.MX) -> ca.MX:
+        """Return rotations (3, 3F) alone, in a third of the time."""
+        rotations: ca.MX = self._of_each(rotation_function, X)
+        return rotations
+
+    def _of_each(self, function: Callable[[int], ca.Function], X: ca.MX) -> Any:
+        frames, nodes, _ = self._shape
+        return function(nodes).map(frames)(X[:, self._columns], *self._arguments)
 
 
 class EliminationStage(NamedTuple):

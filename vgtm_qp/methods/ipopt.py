@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from vgtm_qp.arm.symbols import Constants, Frames, rotated
+from vgtm_qp.arm.arm import tip_frames
+from vgtm_qp.arm.symbols import Constants, rotated
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.errors import SolverError
 from vgtm_qp.methods.resolver import MethodResolver, Moved
@@ -89,8 +90,7 @@ class NonlinearProgram:
             wanted, frame = goal - (1.0 - alpha) * velocity, rotated((alpha - 1.0) * spin) @ turned
         end = (X[:, tip.nodes.tolist()] @ ca.DM(tip.weights) - wanted)[axes(names)]
         if setup.task.turns:
-            frames = Frames(arm.home[tip.nodes][None], tip.frame[None], tip.nodes[None], constants, "tip")
-            rotation = frames.at(X)[0]
+            rotation = tip_frames(arm, constants).rotations(X)
             # The axis of the turn to the goal by its sine, or of three turns by two thirds of it.
             columns = [2] if setup.task.turns == "pointing" else [0, 1, 2]
             twist = sum(ca.cross(frame[:, k], rotation[:, k]) for k in columns) / len(columns)

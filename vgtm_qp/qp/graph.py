@@ -7,6 +7,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from vgtm_qp.arm.arm import tip_frames
 from vgtm_qp.arm.symbols import ArmSymbols, Bound, Constants, Frames
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.rows import curve as curve_rows
@@ -95,8 +96,8 @@ class StepGraph:
         self.tip_position = self.X[:, nodes] @ ca.DM(tip.weights)
         self.tip_rotation, spin = ca.MX.eye(3), ca.MX.zeros(3, 3 * len(nodes))
         if tip.has_frame:
-            frames = tip_frames(self.layout, self._constants)
-            self.tip_rotation, _ = frames.at(self.X)
+            frames = tip_frames(self.layout.arm, self._constants)
+            self.tip_rotation = frames.rotations(self.X)
             _, spin = frames.at(self.Y)
         error = tip_rows.error(rows, self.tip_position, self.tip_rotation, self.goal, self.turned)
         levers = self.table("levers", self.layout.tip_levers)
@@ -116,12 +117,12 @@ class StepGraph:
             return
         home = layout.arm.home
         frames = Frames(home[stations.nodes], stations.frames, stations.nodes, self._constants, "station")
-        self.rotations, _ = frames.at(self.X)
+        self.rotations = frames.rotations(self.X)
         _, self.spins = frames.at(self.Y)
         start = stations.nodes[:1]
         base = Frames(home[start], stations.frames[:1], start, self._constants, "base")
         based = self.X + self.moved
-        rotation, _ = base.at(based)
+        rotation = base.rotations(based)
         centre = based[:, start[0].tolist()] @ ca.DM(stations.weights[0])
         self.base_axes, self.normal = rotation[:, :2], rotation[:, 2]
         self.offset = curve_rows.base_offset(centre, rotation, self.vertices)
@@ -237,12 +238,6 @@ def station_rows(graph: StepGraph) -> list[ca.MX]:
         for k in range(len(layout.tracked))
     ]
     return [ca.horzcat(*column) for column in zip(*found, strict=True)]
-
-
-def tip_frames(layout: Layout, constants: Constants) -> Frames:
-    """Return the end effector's frame."""
-    arm, tip = layout.arm, layout.arm.end_effector
-    return Frames(arm.home[tip.nodes][None], tip.frame[None], tip.nodes[None], constants, "tip")
 
 
 def _given_curve(layout: Layout) -> list[ca.MX]:

@@ -74,7 +74,7 @@ def gap_function(layout: Layout) -> Bound:
         of_station = ca.Function("turns", [rotation, along], [ca.densify(turn)]).map(count)
         frames = Frames(arm.home[nodes], arm.stations.frames[tracked], nodes, constants, "station")
         unit = constants.add("unit", np.array([arm.unit]))
-        errors.append(unit * ca.fabs(ca.vec(of_station(frames.at(X)[0], way))))
+        errors.append(unit * ca.fabs(ca.vec(of_station(frames.rotations(X), way))))
     every = ca.vertcat(*errors)
     total = ca.sum1(every)
     # `mmax` skips NaN; the sum keeps it.

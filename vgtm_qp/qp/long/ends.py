@@ -5,6 +5,7 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
+from vgtm_qp.arm.arm import tip_frames
 from vgtm_qp.arm.symbols import Bound, Constants, Frames, rotated
 from vgtm_qp.qp.fused_rows import leg_rows
 from vgtm_qp.qp.layout import Layout
@@ -36,16 +37,14 @@ class _Ends:
         self.base, self.points = ca.MX.sym("base", 3, 3), ca.MX.sym("p", 3, vertices)
         self.rotation, self.spin = ca.MX.eye(3), ca.MX.zeros(3, self.Y.numel())
         if tip.has_frame:
-            frames = Frames(
-                arm.home[tip.nodes][None], tip.frame[None], np.arange(len(tip.nodes)), self._constants, "tip"
-            )
-            self.rotation, self.spin = frames.at(self.X)[0], frames.at(self.Y)[1]
+            frames = tip_frames(arm, self._constants, np.arange(len(tip.nodes)))
+            self.rotation, self.spin = frames.rotations(self.X), frames.at(self.Y)[1]
         self.offset, self.normal = ca.MX(3, 0), ca.MX.zeros(3)
         self.axes, self.least = ca.MX.zeros(3, 0), ca.MX.zeros(0)
         if vertices:
             home, weights = arm.home[arm.stations.nodes[:1]], ca.DM(arm.stations.weights[0])
             base = Frames(home, arm.stations.frames[:1], np.arange(3), self._constants, "base")
-            turned, _ = base.at(self.base)
+            turned = base.rotations(self.base)
             self.offset = curve_rows.base_offset(self.base @ weights, turned, self.points)
             self.normal = turned[:, 2]
         if len(layout.legs):
