@@ -566,7 +566,7 @@ def tip_function(arm: Arm) -> Bound:
 
 
 def tip_frames(arm: Arm, constants: Constants, columns: Index | None = None) -> Frames:
-    """Return the end effector's frame; `columns` (K,) are those of its nodes among positions, if not all nodes have one."""
+    """Return the end effector's frame, of positions of all nodes, or of those with its own nodes at `columns` (K,)."""
     tip = arm.end_effector
     among = tip.nodes if columns is None else columns
     return Frames(arm.home[tip.nodes][None], tip.frame[None], among[None], constants, "tip")
