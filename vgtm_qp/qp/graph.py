@@ -136,29 +136,19 @@ class StepGraph:
                 self.table("curve_slopes", layout.curve_slopes),
             )
 
-    def station(self, k: int) -> list[ca.MX]:
-        """Return the arguments of :class:`StationSymbols` for the k-th tracked station."""
+    def station(self, k: int) -> tuple[list[ca.MX], list[ca.MX]]:
+        """Return the arguments of :class:`StationSymbols` for the k-th tracked station: its places, and its rates."""
         layout, stations = self.layout, self.layout.arm.stations
         face = int(layout.tracked[k])
         nodes = stations.nodes[face].tolist()
-        arguments = [
-            self.X[:, nodes],
-            self.rotations[:, 3 * face : 3 * face + 3],
-            self.spins[:, 9 * face : 9 * face + 9],
-            ca.MX(ca.DM(stations.weights[face])),
-        ]
+        rotation, spin = self.rotations[:, 3 * face : 3 * face + 3], self.spins[:, 9 * face : 9 * face + 9]
+        places = [self.X[:, nodes], rotation, ca.MX(ca.DM(stations.weights[face]))]
         if layout.general is None:
             weights, slopes = self._tables
-            return [*arguments, self.vertices, weights[:, k], slopes[:, k]]
+            return [*places, self.vertices, weights[:, k], slopes[:, k]], [spin]
         block = slice(3 * k, 3 * k + 3)
-        position, position_rows, frame, spin_rows = self.given[:4]
-        return [
-            *arguments,
-            position[:, k],
-            position_rows[:, block],
-            frame[:, block],
-            spin_rows[:, block],
-        ]
+        position, _, frame, spin_rows = self.given[:4]
+        return [*places, position[:, k], frame[:, block]], [spin, spin_rows[:, block]]
 
 
 class StationSymbols:
@@ -166,8 +156,8 @@ class StationSymbols:
 
     Attributes
     ----------
-    inputs : list
-        The result of ``StepGraph.station``.
+    places, rates : list
+        The result of ``StepGraph.station``; gap and turn are functions of the places alone.
     gap, turn : (3,), (R,)
     face : (R, 9)
         Rows of the turns over the station's nodes.
@@ -176,19 +166,20 @@ class StationSymbols:
     def __init__(self, layout: Layout) -> None:
         nodes, weights = ca.SX.sym("nodes", 3, 3), ca.SX.sym("face", 3)
         rotation, spin = ca.SX.sym("rotation", 3, 3), ca.SX.sym("spin", 3, 9)
-        self.inputs = [nodes, rotation, spin, weights]
+        self.places, self.rates = [nodes, rotation, weights], [spin]
         self._is_tabled = layout.general is None
         if self._is_tabled:
             vertices = ca.SX.sym("p", 3, layout.vertices)
             at, slopes = ca.SX.sym("w", layout.vertices), ca.SX.sym("dw", layout.vertices)
-            self.inputs += [vertices, at, slopes]
+            self.places += [vertices, at, slopes]
             point = vertices @ at
             self.turn, c, self.slope = tracking.slope_rows(rotation, vertices @ slopes)
         else:
             size = 3 * layout.vertices + layout.torsion
-            point, position_rows = ca.SX.sym("position", 3), ca.SX.sym("position_rows", size, 3)
-            frame, spin_rows = ca.SX.sym("frame", 3, 3), ca.SX.sym("spin_rows", size, 3)
-            self.inputs += [point, position_rows, frame, spin_rows]
+            point, frame = ca.SX.sym("position", 3), ca.SX.sym("frame", 3, 3)
+            spin_rows = ca.SX.sym("spin_rows", size, 3)
+            self.places += [point, frame]
+            self.rates += [spin_rows]
             # CasADi reads the frame's rows as columns.
             self.turn, c = tracking.turns(rotation, frame.T, layout.turns)
             self._turned = -c @ spin_rows.T
@@ -231,11 +222,11 @@ def station_rows(graph: StepGraph) -> list[ca.MX]:
         for mask, error in zip(masks, station.drawn(*masks), strict=True)
     ]
     results = [ca.densify(result) for result in (*errors, station.face, station.curve)]
-    function = ca.Function("station", [*station.inputs, *masks, motion], results)
+    function = ca.Function("station", [*station.places, *station.rates, *masks, motion], results)
     hard = [ca.DM(mask.astype(float)) for mask in (layout.hard_gaps, layout.hard_tilts)]
     found = [
-        function(*graph.station(k), *(mask[k, :].T for mask in hard), graph.motion)
-        for k in range(len(layout.tracked))
+        function(*places, *rates, *(mask[k, :].T for mask in hard), graph.motion)
+        for k, (places, rates) in enumerate(map(graph.station, range(len(layout.tracked))))
     ]
     return [ca.horzcat(*column) for column in zip(*found, strict=True)]
 

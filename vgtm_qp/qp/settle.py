@@ -128,8 +128,8 @@ def missing_function(layout: Layout) -> Bound:
     missing = [graph.tip_error]
     if layout.vertices:
         station = StationSymbols(layout)
-        function = ca.Function("off", station.inputs, [station.gap, ca.densify(station.turn)])
-        gaps, turns = zip(*(function(*graph.station(k)) for k in range(len(layout.tracked))), strict=True)
+        function = ca.Function("off", station.places, [station.gap, ca.densify(station.turn)])
+        gaps, turns = zip(*(function(*graph.station(k)[0]) for k in range(len(layout.tracked))), strict=True)
         missing.append(-ca.vertcat(*gaps, *turns)[layout.hard.tolist()])
     results = [ca.vertcat(*missing), graph.tip_position, graph.tip_rotation]
     gone, inputs = ca.MX.sym("gone"), graph.inputs
