@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vgtm_qp.rows.limits import actuator_box, braking_speed
+from vgtm_qp.rows.limits import APPROACH, actuator_box, braking_speed, resting_box
 
 positive = st.floats(0.01, 10.0)
 limit = st.one_of(st.just(np.inf), positive)
@@ -117,3 +117,26 @@ def test_each_actuator_has_its_own_box(rng):
         row = slice(k, k + 1)
         alone = actuator_box(length[row], speed[row], stroke[row], rate[row], acceleration[row], 0.2)
         assert (together[0][k], together[1][k]) == (alone[0][0], alone[1][0])
+
+
+def test_without_limits_of_acceleration_the_box_is_that_of_stroke_and_rate(rng):
+    """Also of actuators outside their strokes, without limits, and that slow down before their ends."""
+    count, dt = 200, 0.2
+    stroke = np.sort(rng.uniform(0.5, 2.0, (count, 2)), axis=1)
+    stroke[rng.uniform(size=count) < 0.2] = (-np.inf, np.inf)
+    value = rng.uniform(0.3, 2.2, count)
+    rate = np.where(rng.uniform(size=count) < 0.2, np.inf, rng.uniform(0.01, 5.0, count))
+    box, free = resting_box(count), np.full(count, np.inf)
+    lower, upper = (
+        np.asarray(side).reshape(-1) for side in box(value, stroke[:, 0], stroke[:, 1], rate * dt, free)
+    )
+    wanted = actuator_box(value, rng.normal(size=count), stroke, rate, free, dt)
+    np.testing.assert_allclose(lower, wanted[0], rtol=0.0, atol=1e-15)
+    np.testing.assert_allclose(upper, wanted[1], rtol=0.0, atol=1e-15)
+    approach = rng.uniform(1e-3, 0.1, count)
+    slow = box(value, stroke[:, 0], stroke[:, 1], rate * dt, approach)
+    for side, found, sense in zip((lower, upper), slow, (-1.0, 1.0), strict=True):
+        left = sense * (side - value)
+        to_end = np.maximum(sense * (stroke[:, int(sense > 0.0)] - value), 0.0)
+        allowed = np.minimum(left, np.maximum(APPROACH * to_end, np.minimum(to_end, approach)))
+        np.testing.assert_allclose(sense * (np.asarray(found).reshape(-1) - value), allowed, atol=1e-15)
