@@ -363,6 +363,20 @@ def test_help_imports_nothing_heavy():
     assert "solve" in done.stdout
 
 
+@pytest.mark.parametrize("given", [None, "3"])
+def test_a_command_holds_blas_to_one_thread_unless_it_is_told_a_number(given):
+    environment = {name: value for name, value in ENVIRONMENT.items() if name != "OPENBLAS_NUM_THREADS"}
+    environment |= {"OPENBLAS_NUM_THREADS": given} if given else {}
+    code = (
+        "import os, sys; from vgtm_qp.cli import main; assert 'numpy' not in sys.modules; "
+        "main(['schema']); print(os.environ['OPENBLAS_NUM_THREADS'], file=sys.stderr)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
+    assert done.stderr.strip() == (given or "1")
+
+
 def test_the_package_gives_its_names_and_keeps_the_function_verify():
     from vgtm_qp.verify.check import verify
 

@@ -152,10 +152,6 @@ def study(
     An interrupted study goes on where it stopped: the rows of finished runs are on disk. A run that crashes or
     hangs loses only itself; it is tried once more alone, and then reported.
     """
-    import os
-
-    # Before NumPy is imported: times and processes are for one BLAS thread each.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from vgtm_qp.study import STUDIES, find_study, run_study, study_tasks
 
     wanted = list(STUDIES) if names == ["all"] else names
