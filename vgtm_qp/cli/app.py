@@ -77,7 +77,7 @@ for order, (name, command) in enumerate(_COMMANDS.items()):
 def main(tokens: Sequence[str] | None = None) -> int:
     """Run one command line, that of the process by default, and return its exit code."""
     given = list(sys.argv[1:] if tokens is None else tokens)
-    # Before NumPy is imported: the matrices are small, and beside a compiler a second thread keeps the first one waiting.
+    # Before NumPy is imported. The matrices are small; beside a compiler a second thread keeps the first one waiting.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # trimesh logs a traceback for a damaged file; the error that it raises is printed in one line.
     logging.getLogger("trimesh").addHandler(logging.NullHandler())
