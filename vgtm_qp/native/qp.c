@@ -18,7 +18,9 @@ typedef struct {
     /* Distance from a bound, and remaining path, that count as zero; worst condition of a gain. */
     double at_bound, left, worst_condition;
     int settling_steps, closing_steps;
-    double too_far, small_error;
+    /* Errors of quantities: beyond the first, Newton's method is not tried; below the second, one step of it leaves so
+       little that the equalities can be measured after it; below the third, it leaves nothing. */
+    double too_far, small_error, tiny_error;
     const double *levers;          /* (m) lengths to compare the equalities by */
     double lever;                  /* m, to compare torsions with lengths by */
 
@@ -672,16 +674,19 @@ static double measured(const Fused *f, const double *a, const double *b)
    after the first have Broyden's updates of the gain, in the form that needs the steps alone. */
 EXPORT int settle(Fused *f)
 {
-    int n = f->unknowns, m = f->tips + f->hard, steps = 0, may_correct = 1, is_measured = 0;
+    int n = f->unknowns, m = f->tips + f->hard, steps = 0, may_correct = 1, is_measured = 0, is_closed = 0;
     double *step = f->work + f->nodes + SUMS * (f->actuators + 1) + n * f->squares;
     for (int count = 0; count <= f->closing_steps + f->settling_steps; count++) {
         if (call(&f->close)) return UNSETTLED;
         /* The norm is NaN if one of the errors is. */
         double error = f->errors[0];
         if (!(error < f->too_far && f->errors[1] < INFINITY)) return UNSETTLED;
-        int is_closed = error <= f->enough_length;
-        if (!is_closed) memcpy(f->q, f->closer, sizeof(double) * f->coordinates);
-        else if (is_measured) break;
+        is_closed = error <= f->enough_length;
+        if (is_closed && is_measured) break;
+        if (!is_closed) {
+            memcpy(f->q, f->closer, sizeof(double) * f->coordinates);
+            is_closed = error <= f->tiny_error;
+        }
         if (error > f->small_error) continue;
         if (f->curve_nodes.eval && (call(&f->curve_nodes) || *f->nodes_are_right != 1.0)) return NO_VALUE;
         if (call(&f->missing)) return UNSETTLED;
@@ -709,7 +714,7 @@ EXPORT int settle(Fused *f)
         advance(f, next, 0);
         is_measured = 0;
     }
-    return is_measured && f->errors[0] <= f->member && f->off <= f->tip ? DONE : UNSETTLED;
+    return is_measured && (is_closed || f->errors[0] <= f->member) && f->off <= f->tip ? DONE : UNSETTLED;
 }
 
 /* Follow the answer of the QP from q, in which the base is where it is after the step, and settle. */

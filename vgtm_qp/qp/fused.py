@@ -53,8 +53,9 @@ _LIBRARIES = (".so", ".dylib", ".dll")
 _ROOM, _SLOTS = 24, 4
 """Capacity at first: rows of clearance, and nodes of each."""
 
-_SMALL_ERROR = 3e-6
-"""Error of a quantity, over the arm's unit, of which one step of Newton's method leaves next to nothing."""
+_SMALL_ERROR, _TINY_ERROR = 3e-6, 1e-11
+"""Errors of a quantity, over the arm's unit, of which one step of Newton's method leaves next to nothing, and nothing.
+"""
 
 
 @cache
@@ -555,6 +556,7 @@ def _numbers(layout: Layout) -> dict[str, Any]:
         "closing_steps": MOST_STEPS,
         "too_far": TOO_FAR * arm.unit,
         "small_error": _SMALL_ERROR * arm.unit,
+        "tiny_error": _TINY_ERROR * arm.unit,
         "feasibility": Daqp(arm.fineness).accuracy,
         "places": len(place),
         "place": place,

@@ -140,17 +140,17 @@ def missing_function(layout: Layout) -> Bound:
 
 
 def closing_function(layout: Layout) -> Bound:
-    """Return the function (q, lower, upper) -> q after one Newton step; quantities (M) and their errors at q.
+    """Return the function (q, lower, upper) -> q after one Newton step; the quantities (M) that it is to have; errors.
 
-    Fixed quantities go to their values, actuators into their boxes (n_a); see ``ArmSymbols.closed``. The
-    errors are given by their greatest magnitude, which skips NaN, and by their norm, which keeps it.
+    Fixed quantities go to their values, actuators into their boxes (n_a); see ``ArmSymbols.closed``. The errors are
+    those at q, given by their greatest magnitude, which skips NaN, and by their norm, which keeps it.
     """
     constants, arm = Constants(), layout.arm
     symbols = arm.symbols(constants)
     q, count = ca.MX.sym("q", *symbols.shape), len(arm.actuators)
     lower, upper = ca.MX.sym("lower", count), ca.MX.sym("upper", count)
     quantities = symbols.quantities(q)
-    off = quantities - symbols.aims(quantities, lower, upper)
-    errors = ca.vertcat(ca.norm_inf(off), ca.norm_2(off))
-    results = [symbols.closed(q, lower, upper), quantities, errors]
+    aims = symbols.aims(quantities, lower, upper)
+    errors = ca.vertcat(ca.norm_inf(quantities - aims), ca.norm_2(quantities - aims))
+    results = [symbols.closed(q, lower, upper), aims, errors]
     return constants.bound("close", [q, lower, upper], results)
