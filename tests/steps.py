@@ -11,7 +11,7 @@ import piqp
 import pytest
 import qpsolvers
 import scipy.sparse
-from arms import random_pose
+from arms import make_layout, random_pose
 from numpy.typing import NDArray
 
 from vgtm_qp.arm.arm import Kinematics, Pose
@@ -194,3 +194,27 @@ def solved(qp: StepQP) -> tuple[Array, Array]:
     above, below = np.split(of_sides, 2)
     multipliers[equal], multipliers[~equal] = found.y, above - below
     return np.asarray(found.x), multipliers
+
+
+def curved(truss, track, curve="tables", family="bezier", weights=None):
+    """A layout whose curve is plain tables, absent, held by the stations, of a shape, or drawn to goals."""
+    layout, _ = make_layout(truss, track, vertices=0 if curve == "none" else 6, weights=weights)
+    if curve in SHAPES:
+        return shaped(layout, curve, family=family)
+    if curve in ("hard", "hard turns"):
+        return replace(layout, hard_tracking=True, hard_turns=curve == "hard turns")
+    if curve == "hard torsion":
+        return shaped(layout, "torsion", family=family, hard=True)
+    return shaped(layout, family=family, goals=(2, 4)) if curve == "drawn" else layout
+
+
+def asked_at_random(layout, seed, *, base, progress, motion):
+    """What a QP is asked for at a configuration, its Jacobians at another one, and its clearance rows."""
+    rng = np.random.default_rng(seed)
+    X, Y, vertices, target, rows = make_step(layout, layout.arm.kinematics(compiled=False), rng, base=base)
+    goals = np.full(vertices.shape, np.nan)
+    if layout.vertex_goals:
+        goals[2], goals[4] = vertices[2] + [0.3, 0.0, 0.0], vertices[4] + [0.0, 0.002, 0.0]
+    target, torsion = replace(target, vertex_goals=goals), 0.1 * rng.normal(size=layout.torsion)
+    goal = target.goal(progress)
+    return QPInput(X, Y, vertices, torsion, target, goal, progress, rows, motion).linear(layout), rows

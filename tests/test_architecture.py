@@ -11,6 +11,10 @@ from pathlib import Path
 import pytest
 
 import vgtm_qp
+from vgtm_qp.geometry.exact import CONTACT
+from vgtm_qp.qp.fused import SUMS
+from vgtm_qp.qp.long.working_set import BLOCK
+from vgtm_qp.step.separation import MOST_PIECES
 
 PACKAGE = Path(vgtm_qp.__file__).parent
 TESTS = Path(__file__).parent
@@ -151,6 +155,19 @@ def test_tests_read_no_private_names() -> None:
     files = sorted(set(TESTS.rglob("*.py")) - {Path(__file__)})
     found = {file.name: list(private_names(file.read_text(encoding="utf-8"))) for file in files}
     assert not {name: names for name, names in found.items() if names}
+
+
+def test_tests_import_no_other_test() -> None:
+    imports = re.compile(r"^\s*(?:from|import) test_\w+", re.MULTILINE)
+    assert not [file.name for file in TESTS.glob("*.py") if imports.search(file.read_text(encoding="utf-8"))]
+
+
+def test_what_c_and_python_both_know_is_the_same() -> None:
+    """Numbers that size the arrays which Python makes and C fills."""
+    text = "".join(file.read_text(encoding="utf-8") for file in sorted((PACKAGE / "native").glob("*.[ch]")))
+    of_c = {name: int(value) for name, value in re.findall(r"\b([A-Z_]+) = (\d+)\b", text)}
+    known = {"MOST_PIECES": MOST_PIECES, "BLOCK": BLOCK, "CONTACT": CONTACT, "SUMS": SUMS}
+    assert {name: of_c[name] for name in known} == known
 
 
 @pytest.mark.parametrize(

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import oracle
 import pytest
-from arms import TRUSSES, make_layout
-from steps import SHAPES, make_step, shaped
+from arms import TRUSSES
+from steps import SHAPES, asked_at_random, curved
 
 from vgtm_qp.compiled import compiler
 from vgtm_qp.native import Code, building
@@ -17,7 +17,6 @@ from vgtm_qp.qp.fused import FusedSolver
 from vgtm_qp.qp.fused_rows import RESULTS
 from vgtm_qp.qp.linearise import Linearisation
 from vgtm_qp.rows.curve import free_basis
-from vgtm_qp.step.target import QPInput
 
 FRAMED = [name for name in TRUSSES if name != "graph"]
 TRACKS = [("position",), ("y",), ("x", "z"), ("z", "orientation"), ("orientation",)]
@@ -25,30 +24,6 @@ CURVES = ["tables", "none", "hard", "hard turns", *SHAPES, "hard torsion", "draw
 
 
 pytestmark = pytest.mark.skipif(compiler() is None, reason="no C compiler")
-
-
-def curved(truss, track, curve="tables", family="bezier", weights=None):
-    """A layout whose curve is plain tables, absent, held by the stations, of a shape, or drawn to goals."""
-    layout, _ = make_layout(truss, track, vertices=0 if curve == "none" else 6, weights=weights)
-    if curve in SHAPES:
-        return shaped(layout, curve, family=family)
-    if curve in ("hard", "hard turns"):
-        return replace(layout, hard_tracking=True, hard_turns=curve == "hard turns")
-    if curve == "hard torsion":
-        return shaped(layout, "torsion", family=family, hard=True)
-    return shaped(layout, family=family, goals=(2, 4)) if curve == "drawn" else layout
-
-
-def asked_at_random(layout, seed, *, base, progress, motion):
-    """What a QP is asked for at a configuration, its Jacobians at another one, and its clearance rows."""
-    rng = np.random.default_rng(seed)
-    X, Y, vertices, target, rows = make_step(layout, layout.arm.kinematics(compiled=False), rng, base=base)
-    goals = np.full(vertices.shape, np.nan)
-    if layout.vertex_goals:
-        goals[2], goals[4] = vertices[2] + [0.3, 0.0, 0.0], vertices[4] + [0.0, 0.002, 0.0]
-    target, torsion = replace(target, vertex_goals=goals), 0.1 * rng.normal(size=layout.torsion)
-    goal = target.goal(progress)
-    return QPInput(X, Y, vertices, torsion, target, goal, progress, rows, motion).linear(layout), rows
 
 
 def compare(layout, seeds=range(1)):

@@ -321,3 +321,19 @@ def test_resorts_are_the_named_limits_and_at_last_the_obstacle_out_of_the_way():
         "angle",
         "rate",
     ]
+
+
+def test_what_is_locked_stays_where_it_is_with_the_limits_of_a_remedy():
+    """A resolver with other limits is built at home; its locks hold what they find."""
+    resolver = vq.Resolver(vq.load_problem("five_bay_free"))
+    start = resolver.tip()[0]
+    for k in range(12):
+        resolver.step(position=start + np.array([0.05 * k, 0.0, -0.03 * k]))
+    resolver.lock("B5-3")
+    more = Change(Limit("rate", ""), 0.1, "m/s")
+    other, k = resolver.relaxed(Remedy((more,), 1.0)), resolver.setup.arm.quantity_names.index("B5-3")
+    held = resolver.state.quantities[k]
+    assert abs(held - resolver.setup.home_state().quantities[k]) > 0.1
+    for j in range(5):
+        assert other.step(position=start + np.array([0.6 + 0.05 * j, 0.0, -0.4])).moved
+    assert other.state.quantities[k] == pytest.approx(held, abs=1e-9)

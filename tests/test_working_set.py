@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from arms import TRUSSES
-from test_fused_rows import asked_at_random, curved
+from steps import asked_at_random, curved
 
 from vgtm_qp.compiled import compiler
 from vgtm_qp.errors import SolverError

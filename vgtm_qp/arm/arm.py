@@ -8,7 +8,8 @@ reference curve, and the last station is the end effector.
 An arm is moved by its *quantities* [c; a]: fixed ones, c(q) = const, and actuated ones a(q), which have
 boxes. There are as many quantities as coordinates of q, so that to first order the nodes move by K d_a + r.
 
-Nothing outside the folder ``arm`` depends on the kind of arm.
+Rows, QPs and steps know nothing else of an arm. Outside the folder ``arm`` the methods that move the curve first ask
+for its kind.
 """
 
 from __future__ import annotations

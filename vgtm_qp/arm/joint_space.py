@@ -302,6 +302,11 @@ class JointSpaceSymbols(ArmSymbols):
         _, twists = self._turning(at, *self._constants)
         return twists[:, self._actuators]
 
+    def movers(self) -> Index:
+        arm = self._arm
+        moved = np.concatenate([[0], np.cumsum(arm.actuated)])[arm.movers]
+        return np.asarray(moved[arm.free])
+
     def coordinates(self, nodes: Any, strokes: Any) -> Any:  # noqa: ARG002
         """See ``arm.ArmSymbols``: the actuators."""
         return strokes

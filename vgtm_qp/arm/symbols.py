@@ -136,8 +136,12 @@ class ArmSymbols(ABC):
         return ()
 
     def twists(self, at: Any) -> Any:  # noqa: ARG002
-        """Return (6, n_a) twists of the actuators, see ``JointSpaceArm.functions``; None if nodes do not move so."""
+        """Return (6, n_a) twists by which actuators move nodes: turn, velocity of the origin; None if they do not."""
         return None
+
+    def movers(self) -> Index:
+        """Return (N - N_c,) how many actuators, from the first, move each free node by their :meth:`twists`."""
+        return np.zeros(0, dtype=np.int64)
 
     @abstractmethod
     def coordinates(self, nodes: Any, strokes: Any) -> Any:
@@ -160,6 +164,11 @@ class ArmSymbols(ABC):
     def follows(self, tracked: Sequence[int]) -> bool:  # noqa: ARG002
         """Whether fixed quantities and the places of `tracked` stations determine the configuration, stage by stage."""
         return False
+
+
+def goal_after(goal: Any, turned: Any, velocity: Any, spin: Any, gone: Any) -> tuple[Any, Any]:
+    """Return position and rotation of a `goal`, `turned` (3, 3), that moves on by a progress `gone` at its rates."""
+    return goal + gone * velocity, rotated(gone * spin) @ turned
 
 
 def rotated(vector: Any) -> Any:

@@ -24,9 +24,7 @@ def beyond_limits(arm: Arm, problem: Mapping[str, Any], time: Array, values: Arr
     names, free = arm.quantity_names, arm.actuated
     locks = [(names.index(name), since) for name, since in locks_of(problem) if name in names]
     yield from _out_of_range(arm, time, values)
-    rates, accelerations, rounding, its_rounding = changes(time, values, float(np.abs(values).max()))
-    for k, since in locks:
-        accelerations[np.abs(time[1:-1] - since) <= INSTANT, k] = 0.0
+    rates, accelerations, rounding, its_rounding = changes(time, values, float(np.abs(values).max()), locks)
     faster = free & (np.abs(rates) - rounding > arm.rate + LIMIT_TOLERANCE)
     for k, run in _runs(faster):
         worst = run[int(np.argmax(np.abs(rates[run, k])))]

@@ -22,7 +22,7 @@ from vgtm_qp.cli.problems import check, list_problems, schema
 from vgtm_qp.cli.results import export, replay, verify, view
 from vgtm_qp.cli.solve import solve
 from vgtm_qp.errors import AlteredResultError, ProblemError, VgtmError, nearest
-from vgtm_qp.machine import noting_interrupts
+from vgtm_qp.machine import THREADS, noting_interrupts
 from vgtm_qp.notices import telling
 
 _NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}
@@ -78,7 +78,8 @@ def main(tokens: Sequence[str] | None = None) -> int:
     """Run one command line, that of the process by default, and return its exit code."""
     given = list(sys.argv[1:] if tokens is None else tokens)
     # Before NumPy is imported. The matrices are small; beside a compiler a second thread keeps the first one waiting.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    for name in THREADS:
+        os.environ.setdefault(name, "1")
     # trimesh logs a traceback for a damaged file; the error that it raises is printed in one line.
     logging.getLogger("trimesh").addHandler(logging.NullHandler())
     try:

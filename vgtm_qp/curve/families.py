@@ -90,7 +90,11 @@ class CurveFamily:
     @cached_property
     def cells(self) -> Array:
         """(C + 1,) a subdivision of the segments, fine enough for quadrature and for moving a frame along."""
-        pieces = max(2, -(-_QUADRATURE_CELLS // (len(self.breaks) - 1)))
+        return self.divided(_QUADRATURE_CELLS)
+
+    def divided(self, cells: int) -> Array:
+        """Return (C + 1,) the ends of at least so many `cells` in equal parts of the segments."""
+        pieces = max(2, -(-cells // (len(self.breaks) - 1)))
         return np.append(within(self.breaks, np.arange(pieces) / pieces), 1.0)
 
     @cached_property

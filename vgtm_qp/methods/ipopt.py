@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 
 from vgtm_qp.arm.arm import tip_frames
-from vgtm_qp.arm.symbols import Constants, rotated
+from vgtm_qp.arm.symbols import Constants, goal_after
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.errors import SolverError
 from vgtm_qp.methods.resolver import MethodResolver, Moved
@@ -87,7 +87,7 @@ class NonlinearProgram:
         q, actuators = symbols.along(start, d), arm.actuators.tolist()
         X, quantities, wanted, frame = symbols.nodes(q), symbols.quantities(q), goal, turned
         if self._progress:
-            wanted, frame = goal - (1.0 - alpha) * velocity, rotated((alpha - 1.0) * spin) @ turned
+            wanted, frame = goal_after(goal, turned, velocity, spin, alpha - 1.0)
         end = (X[:, tip.nodes.tolist()] @ ca.DM(tip.weights) - wanted)[axes(names)]
         if setup.task.turns:
             rotation = tip_frames(arm, constants).rotations(X)

@@ -112,7 +112,7 @@ class Tracker:
     def _converge(
         self, chain: _Chain, start: Array, q: Array, travelled: Array, step: Array, nodes: CurveNodes
     ) -> None:
-        """Move the segments of a chain to their places; updates `q` and the displacements, `travelled`."""
+        """Move the segments of a chain to their places; writes `q`, `travelled` and the last `step`."""
         # The first step starts at the old configuration of the segments before, and has their displacement as
         # input.
         at, step[chain.before] = start, travelled[chain.before]

@@ -1241,12 +1241,8 @@ static int is_closed(const Chain *c)
 EXPORT int chain_depart(Chain *c, double tolerance)
 {
     if (!(c->primal <= tolerance && c->dual <= tolerance)) return INACCURATE;
-    double before = *c->progress, reached = fmin(fmax(before + c->step, 0.0), 1.0), fastest = 0.0;
-    for (int k = 0; k < 3; k++) fastest = fmax(fastest, fmax(fabs(c->velocity[k]), fabs(c->spin[k])));
-    /* Interior-point solvers stop just short of the end; the arm would need one more step. */
-    if ((1.0 - reached) * fastest <= c->left) reached = 1.0;
-    c->reached = reached;
-    *(double *)c->missing.arg[5] = reached - before;
+    c->reached = reached_by(*c->progress, c->step, c->velocity, c->spin, c->left);
+    *(double *)c->missing.arg[5] = c->reached - *c->progress;
     c->furthest = 0.0;
     for (int k = 0; k < c->periods * c->own; k++) {
         double moved = c->displaced[c->own + k];

@@ -33,7 +33,7 @@ typedef struct {
     const double *curve_is_right, *nodes_are_right;
     void (*quadprog)(DAQPResult *, DAQPProblem *, DAQPSettings *);
     void (*defaults)(DAQPSettings *);
-    /* Another solver instead, or null: it sets x, multipliers and iterations, and returns a code as above. */
+    /* Another solver instead, or null: it sets x, multipliers and iterations, and returns a code of base.h. */
     int (*other)(void);
     double feasibility;
 
@@ -717,16 +717,21 @@ EXPORT int settle(Fused *f)
     return is_measured && (is_closed || f->errors[0] <= f->member) && f->off <= f->tip ? DONE : UNSETTLED;
 }
 
+/* The progress after a `step` from that `before`; 1 where what is left of the path at these rates is no more than `left`:
+   interior-point solvers stop just short of the end, and the arm would need one more step. */
+static double reached_by(double before, double step, const double *velocity, const double *spin, double left)
+{
+    double reached = fmin(fmax(before + step, 0.0), 1.0), fastest = 0.0;
+    for (int k = 0; k < 3; k++) fastest = fmax(fastest, fmax(fabs(velocity[k]), fabs(spin[k])));
+    return (1.0 - reached) * fastest <= left ? 1.0 : reached;
+}
+
 /* Follow the answer of the QP from q, in which the base is where it is after the step, and settle. */
 static int depart(Fused *f, const double *q, double tolerance)
 {
     if (!(f->primal <= tolerance && f->dual <= tolerance)) return INACCURATE;
-    double before = *f->progress, reached = fmin(fmax(before + f->x[f->unknowns - 1], 0.0), 1.0), fastest = 0.0;
-    for (int k = 0; k < 3; k++) fastest = fmax(fastest, fmax(fabs(f->velocity[k]), fabs(f->spin[k])));
-    /* Interior-point solvers stop just short of the end; the arm would need one more step. */
-    if ((1.0 - reached) * fastest <= f->left) reached = 1.0;
-    f->reached = reached;
-    *f->gone = reached - before;
+    f->reached = reached_by(*f->progress, f->x[f->unknowns - 1], f->velocity, f->spin, f->left);
+    *f->gone = f->reached - *f->progress;
     memcpy(f->q, q, sizeof(double) * f->coordinates);
     memcpy(f->points, f->condense.arg[3], sizeof(double) * 3 * f->vertices);
     if (f->torsion) memcpy(f->torsions, f->curve.arg[1], sizeof(double) * f->torsion);

@@ -20,7 +20,7 @@ class StepSolution:
         Displacements of all nodes, base nodes included, m; (0, 3), like `vertices`, if one compiled call made
         the whole move.
     actuators : (n_a,)
-        Changes of the actuated lengths, m.
+        Changes of the actuated quantities, m or rad.
     vertices : (V, 3)
         Displacements of the control vertices, m.
     torsion : (T,)

@@ -115,7 +115,7 @@ class _CurveGraph:
         segments = len(family.breaks) - 1
         self._breaks = self._constants.add("breaks", family.breaks).T
         self._extraction = self._constants.add("extraction", family.extraction.reshape(segments, -1))
-        self._cells = _cells(family)
+        self._cells = family.divided(_CELLS)
         self._edges = self._constants.add("cells", self._cells).T
         given = self._constants.add("nodes", shape.nodes).T
         self._s = self._located(given) if shape.by_arc_length else given
@@ -340,12 +340,6 @@ class _CurveGraph:
         )
         lengths, changes = function.map(len(home))(points[:, :-1], points[:, 1:], rows[:, :-3], rows[:, 3:])
         return [lengths.T - self._constants.add("spacing", home), changes]
-
-
-def _cells(family: CurveFamily) -> Array:
-    """Return (C + 1,) the ends of the cells of the quadratures, none of which crosses a break."""
-    pieces = max(2, -(-_CELLS // (len(family.breaks) - 1)))
-    return np.append(within(family.breaks, np.arange(pieces) / pieces), 1.0)
 
 
 def _finest_parts(nodes: Array, weights: Array) -> Array:

@@ -1,4 +1,4 @@
-"""DAQP, the dense active-set solver: the one place that calls it."""
+"""DAQP, the dense active-set solver: the one place of Python that calls it; ``native/qp.c`` has that of C."""
 
 from __future__ import annotations
 

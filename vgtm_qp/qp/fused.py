@@ -15,7 +15,6 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.arm.joint_space import JointSpaceArm
 from vgtm_qp.arm.symbols import Constants, EliminationStage
 from vgtm_qp.arrays import Array, Index, record
 from vgtm_qp.compiled import Kernel
@@ -52,6 +51,9 @@ _LIBRARIES = (".so", ".dylib", ".dll")
 
 _ROOM, _SLOTS = 24, 4
 """Capacity at first: rows of clearance, and nodes of each."""
+
+SUMS = 16
+"""Numbers of ``qp.c`` that sum up the nodes which an actuator moves."""
 
 _SMALL_ERROR, _TINY_ERROR = 3e-6, 1e-11
 """Errors of a quantity, over the arm's unit, of which one step of Newton's method leaves next to nothing, and nothing.
@@ -270,7 +272,7 @@ class FusedWorkspace:
         symbols = arm.symbols(Constants())
         self._stages = symbols.elimination()
         moves_by_twists = symbols.twists(ca.MX.sym("q", *symbols.shape)) is not None
-        self._movers = _movers(layout) if moves_by_twists else None
+        self._movers = symbols.movers().astype(np.int32) if moves_by_twists else None
         self._is_ready: bool | None = None
         self._accuracy: Accuracy | None = None
         self._goals: object = None
@@ -425,7 +427,7 @@ class FusedWorkspace:
         self.offset, self.normal = found["offset"].reshape(-1, 3), found["normal"]
         self._response = np.zeros((nodes, 1 + self.actuators))
         self.stack = np.zeros((size, rows))
-        sums = 16 * (self.actuators + 1)
+        sums = SUMS * (self.actuators + 1)
         work = nodes + sums + size * (rows + SETTLING_STEPS + 2)
         self._program = Program("Fused")
         self._program.set(**_numbers(layout), **daqp_addresses(), unknowns=size)
@@ -648,14 +650,6 @@ def _first_rows(layout: Layout, stages: Sequence[EliminationStage], size: int) -
         first[:count][np.isin(arm.actuators, stage.rows)] = begin
     first[count:-1] = layout.node_columns
     return first
-
-
-def _movers(layout: Layout) -> NDArray[np.int32]:
-    """Return (N - N_c,) how many actuators, from the first, move each free node."""
-    arm = layout.arm
-    assert isinstance(arm, JointSpaceArm)
-    moved = np.concatenate([[0], np.cumsum(arm.actuated)])[arm.movers]
-    return np.asarray(moved[arm.free], dtype=np.int32)
 
 
 def _places(layout: Layout) -> tuple[NDArray[np.int32], NDArray[np.int32], Array, bool]:

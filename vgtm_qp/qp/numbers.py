@@ -20,11 +20,11 @@ from vgtm_qp.qp.terms import Curvature
 class ClearanceRows:
     """Linearised clearances: sum over slots of coefficients . d rho[nodes] >= lower, in m.
 
-    ``nodes`` (R, 4) are node indices: the two ends of the member, then those of the other member in a self
-    pair (otherwise the same again with zero coefficients); with offset joints (R, 12), the triangles of those
-    four ends. ``coefficients`` is (R, 4, 3) or (R, 12, 3). Base nodes may occur; their displacement is
-    already part of ``lower``. ``by_fcl`` and ``by_formula`` count the rows that FCL and closed forms
-    supplied; the other rows are of angles.
+    ``nodes`` (R, 4) are node indices: the two ends of the member or link, then those of the other one in a self
+    pair (otherwise the same again with zero coefficients), or the four nodes of a hull; with offset joints, or two
+    hulls, there are more. ``coefficients`` is (R, S, 3) for S nodes. Base nodes may occur; their displacement is
+    already part of ``lower``. ``by_fcl`` and ``by_formula`` count the rows that FCL and closed forms supplied; the
+    other rows are of angles, or of the user's own.
     """
 
     nodes: Index = field(default_factory=lambda: np.zeros((0, 4), dtype=np.int64))

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve, solve_triangular
 
-from vgtm_qp.arm.symbols import Bound, Constants, rotated
+from vgtm_qp.arm.symbols import Bound, Constants, goal_after
 from vgtm_qp.arrays import Array
 from vgtm_qp.qp.answer import StepSolution
 from vgtm_qp.qp.graph import StationSymbols, StepGraph
@@ -133,8 +133,8 @@ def missing_function(layout: Layout) -> Bound:
         missing.append(-ca.vertcat(*gaps, *turns)[layout.hard.tolist()])
     results = [ca.vertcat(*missing), graph.tip_position, graph.tip_rotation]
     gone, inputs = ca.MX.sym("gone"), graph.inputs
-    goal = [graph.goal + gone * graph.velocity, rotated(gone * graph.spin) @ graph.turned]
-    results = ca.graph_substitute(results, [graph.goal, graph.turned], goal)
+    goal = goal_after(graph.goal, graph.turned, graph.velocity, graph.spin, gone)
+    results = ca.graph_substitute(results, [graph.goal, graph.turned], list(goal))
     arguments = inputs[: len(inputs) - len(constants.symbols)]
     return constants.bound("missing", [*arguments, gone], results)
 

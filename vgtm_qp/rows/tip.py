@@ -36,7 +36,7 @@ _NO_WAY = 1e-6
 """Displacement, over the arm's unit, that counts as zero."""
 
 _CLOSED = 2e-8
-"""Tip error that a motion need not close, m: twice the tolerance of a settled state."""
+"""Tip error that a motion need not close, m, for arms of a fineness of 1: twice the tolerance at a unit of 1 m."""
 
 _OPPOSITE = 1e-9
 """Angle from the opposite direction, rad, below which half a turn about any axis will do."""

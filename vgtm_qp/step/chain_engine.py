@@ -69,7 +69,7 @@ class ChainEngine(Engine):
     def move(self, asked: QPInput, accuracy: Accuracy, spent: Spent) -> Move:
         """See ``engine.Engine``; by one call of C once that is compiled.
 
-        It does not apply if the path turns within the step, or the base moves.
+        It does not apply if the path bends within the step, or the base moves.
         """
         target, moved = asked.target, None
         is_straight = target.base is None and target.path.is_straight(target.start, target.end)

@@ -1,8 +1,9 @@
 """The usual step in one call of C: from a state and its target to the next state and the proof of the way there.
 
-It takes the same step as an attempt of :mod:`vgtm_qp.step.attempt`, in a third of the time. What is unusual it leaves
-to that: pairs that are too near already, meshes and hulls, angles, a path that bends within the step, rows at places
-between two states. Each further QP is one more call. See ``native/step.c``.
+It takes the same step as an attempt of :mod:`vgtm_qp.step.attempt`, in a third of the time or less. What is unusual it
+leaves to that: pairs that are too near already, meshes and hulls, angles, what the tip carries, a limit of
+displacements, a path that bends within the step, rows at places between two states. Each further QP is one more call.
+See ``native/step.c``.
 """
 
 from __future__ import annotations

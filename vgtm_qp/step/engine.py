@@ -338,7 +338,7 @@ class FusedEngine(Engine):
     def move(self, asked: QPInput, accuracy: Accuracy, spent: Spent) -> Move:
         """See :class:`Engine`; one compiled call also settles the answer, if it applies.
 
-        It does not apply if the path turns within the step, or the base moves.
+        It does not apply if the path bends within the step, or the base moves.
         """
         if not self.solver.is_ready:
             return self._plain.move(asked, accuracy, spent)

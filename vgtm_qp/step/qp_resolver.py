@@ -192,11 +192,12 @@ class QPResolver(Resolver, serves="qp"):
         state: State | None = None,
     ) -> Stop:
         """See :class:`Resolver`."""
-        state, dt = state or self.state, self.setup.dt if dt is None else dt
-        limits = self._actuation.limits(state, dt).of_stop()
-        goal = path.at(start).over(end - start)
-        stop = explain(self.setup, self._separation, state, goal, limits, last)
-        return struck(stop, self.setup, self._separation, state, dt)
+        with self._lock:
+            state, dt = state or self.state, self.setup.dt if dt is None else dt
+            limits = self._actuation.limits(state, dt).of_stop()
+            goal = path.at(start).over(end - start)
+            stop = explain(self.setup, self._separation, state, goal, limits, last)
+            return struck(stop, self.setup, self._separation, state, dt)
 
     def _after_change(self) -> Near:
         """See :class:`ChangingScene`; braking steps stay as they were, since the arm cannot stop sooner.
@@ -221,9 +222,10 @@ class QPResolver(Resolver, serves="qp"):
     def relaxed(self, remedy: Remedy) -> QPResolver:
         """See :class:`Resolver`."""
         other = QPResolver(relaxed(self.setup, remedy.changes))
+        # Locks hold what they find.
+        other.state = replace(self.state, shortfall=None)
         for name in self._actuation.locked:
             other.lock(name)
-        other.state = replace(self.state, shortfall=None)
         return other
 
     def again(self, problem: Problem) -> QPResolver:

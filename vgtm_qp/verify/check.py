@@ -130,9 +130,8 @@ def _limits(maneuver: Result, arm: Arm, lengths: Array) -> dict[str, Measure]:
     for k, since in locks:
         rows = np.flatnonzero(time >= since - INSTANT)
         held[rows, k] = np.maximum(held[rows, k], np.abs(lengths[rows, k] - lengths[rows[:1], k]))
-    rates, accelerations, rounding, its_rounding = changes(time, lengths, float(np.abs(maneuver.nodes).max()))
-    for k, since in locks:
-        accelerations[np.abs(time[1:-1] - since) <= INSTANT, k] = 0.0
+    size = float(np.abs(maneuver.nodes).max())
+    rates, accelerations, rounding, its_rounding = changes(time, lengths, size, locks)
     poses = base_poses(maneuver.manifest["problem"], time)
     placed = arm.home[arm.base] @ np.swapaxes(rotations(poses[:, 3:]), 1, 2) + poses[:, None, :3]
     moved = np.linalg.norm(maneuver.nodes[:, arm.base] - placed, axis=2)
@@ -151,16 +150,21 @@ def _limits(maneuver: Result, arm: Arm, lengths: Array) -> dict[str, Measure]:
     }
 
 
-def changes(time: Array, values: Array, size: float) -> tuple[Array, Array, Array, Array]:
+def changes(
+    time: Array, values: Array, size: float, locks: Sequence[tuple[int, float]]
+) -> tuple[Array, Array, Array, Array]:
     """Return rates (T - 1, M), accelerations (T - 2, M) of values (T, M) at times (T,), and their rounding.
 
-    Times are in s. The last two results are bounds of the errors of a rate and of an acceleration by the
+    Times are in s. A rate that ends because its actuator locks does not count as an acceleration: `locks` are numbers
+    of actuators and times. The last two results are bounds of the errors of a rate and of an acceleration by the
     rounding of times, and of values as large as `size`.
     """
     durations = np.diff(time)[:, None]
     between = 0.5 * (durations[1:] + durations[:-1])
     rates = np.diff(values, axis=0) / durations
     accelerations = np.diff(rates, axis=0) / between
+    for k, since in locks:
+        accelerations[np.abs(time[1:-1] - since) <= INSTANT, k] = 0.0
     rounding = _ROUNDING * (size + np.abs(rates) * np.abs(time[1:, None])) / durations
     return rates, accelerations, rounding, (rounding[1:] + rounding[:-1]) / between
 

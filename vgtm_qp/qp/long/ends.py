@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 
 from vgtm_qp.arm.arm import tip_frames
-from vgtm_qp.arm.symbols import Bound, Constants, Frames, rotated
+from vgtm_qp.arm.symbols import Bound, Constants, Frames, goal_after
 from vgtm_qp.qp.fused_rows import leg_rows
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.rows import curve as curve_rows
@@ -111,7 +111,7 @@ def missing_tip_function(layout: Layout) -> Bound:
     goal, turned = ca.MX.sym("goal", 3), ca.MX.sym("turned", 3, 3)
     velocity, spin, gone = ca.MX.sym("velocity", 3), ca.MX.sym("spin", 3), ca.MX.sym("gone")
     position = ends.X @ ca.DM(tip.weights)
-    there = goal + gone * velocity, rotated(gone * spin) @ turned
+    there = goal_after(goal, turned, velocity, spin, gone)
     error = tip_rows.error(layout.tip_rows, position, ends.rotation, *there)
     inputs = [ends.X, goal, turned, velocity, spin, gone]
     return ends.bound("missing_tip", inputs, [error, position, ends.rotation])
