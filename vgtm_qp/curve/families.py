@@ -27,7 +27,10 @@ _MOST_KNOWN = 64
 
 @dataclass(frozen=True, eq=False)
 class CurveFamily:
-    """The weights w_i(s), 0 <= s <= 1, of eqs. (29)-(30): non-negative, with sum 1."""
+    """The weights w_i(s), 0 <= s <= 1, of a curve's control vertices: non-negative, with sum 1.
+
+    See eqs. (29)-(30).
+    """
 
     name: str
     """One of `FAMILIES`."""

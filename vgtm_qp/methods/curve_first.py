@@ -22,7 +22,9 @@ from vgtm_qp.step.path import Path
 
 
 class CurveFirstResolver(MethodResolver, serves="curve-pseudoinverse"):
-    """Moves the curve by itself, by eqs. (37)-(38), then the arm after it, recursively or in parallel.
+    """Moves the curve by itself, then the arm after it, recursively or in parallel.
+
+    The curve moves by eqs. (37)-(38).
 
     Raises
     ------

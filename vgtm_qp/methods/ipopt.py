@@ -18,7 +18,7 @@ from vgtm_qp.errors import SolverError
 from vgtm_qp.methods.resolver import MethodResolver, Moved
 from vgtm_qp.problem import Problem
 from vgtm_qp.rows.tip import TipGoal, axes, turned_axes
-from vgtm_qp.step.actuation import Box
+from vgtm_qp.step.actuation import Box, within
 from vgtm_qp.step.build import build_arm
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.separation import Separation
@@ -263,14 +263,10 @@ class NonlinearResolver(MethodResolver):
 
     def _box(self, state: State, dt: float) -> Box:
         """Return the box of the actuators after a step, for a share of it within a trust region."""
-        lower, upper = self._actuation.box(state, dt)
+        arm, box = self.setup.arm, self._actuation.box(state, dt)
         if self._share == 1.0:
-            return lower, upper
-        arm, values = self.setup.arm, self._actuation.values(state)
-        trust = self._share * _TRUST * arm.unit / arm.levers
-        return np.minimum(np.maximum(lower, values - trust), upper), np.maximum(
-            np.minimum(upper, values + trust), lower
-        )
+            return box
+        return within(box, self._actuation.values(state), self._share * _TRUST * arm.unit / arm.levers)
 
     def _refuse_breakdown(self, nodes: Array, path: Path, start: float, end: float) -> None:  # noqa: ARG002
         """Raise SolverError if a node moves further than the problem allows; nothing is linear here."""

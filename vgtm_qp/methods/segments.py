@@ -30,9 +30,10 @@ _BENDS, _NOTHING = 0.1, 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Segment:
-    """Consecutive bays or joints that track one curve node with their end station, eq. (39).
+    """Consecutive bays or joints that track one curve node with their end station.
 
-    Its coordinates are displacements, m: of nodes, three to a node; or of joints, angles times the arm's unit.
+    See eq. (39). Its coordinates are displacements, m: of nodes, three to a node; or of joints, angles times the arm's
+    unit.
 
     Attributes
     ----------

@@ -1006,11 +1006,7 @@ static int check(Chain *c)
     if (period_residuals(c, shift, dual, &left, &off)) return NO_VALUE;
     for (int r = 0; r < c->total; r++) {
         double y = c->every[r], value = c->value[r], curve[n + 1];
-        double out = fmax(value - c->high[r], c->low[r] - value);
-        /* A comparison with NaN fails. */
-        if (!(out <= 0.0)) left += out * out;
-        double slack = y * fmin(fmax(y > 0.0 ? c->high[r] - value : value - c->low[r], 0.0), 1.0);
-        loose += slack * slack;
+        add_residuals(y, value, c->low[r], c->high[r], &left, &loose);
         multipliers += y * y;
         if (y == 0.0 || !n || !((r >= end_at(c) && r < equal(c)) || (r > equal(c) && r < strokes_at(c)))) continue;
         const int *nodes = NULL;

@@ -394,6 +394,17 @@ static void constrain(Fused *f)
     }
 }
 
+/* Add the squares of a value's violation of its bounds, and of its multiplier times the distance from them; see
+   residual.loose. */
+static void add_residuals(double multiplier, double value, double lower, double upper, double *beyond, double *loose)
+{
+    double out = fmax(value - upper, lower - value);
+    /* A comparison with NaN fails. */
+    if (!(out <= 0.0)) *beyond += out * out;
+    double slack = multiplier * fmin(fmax(multiplier > 0.0 ? upper - value : value - lower, 0.0), 1.0);
+    *loose += slack * slack;
+}
+
 /* Norm of the answer's violations of its bounds. Relative to the forces, the greater of two norms: of the
    stationarity, and of the multipliers times their distances from their bounds. */
 static void residuals(Fused *f, int rows)
@@ -405,11 +416,7 @@ static void residuals(Fused *f, int rows)
     for (int k = 0; k < n + rows; k++) {
         const double *row = f->constraint + (k - n) * n;
         double value = k < n ? f->x[k] : dot(row, f->x, n);
-        double out = fmax(value - f->upper[k], f->lower[k] - value);
-        /* A comparison with NaN fails. */
-        if (!(out <= 0.0)) beyond += out * out;
-        double slack = y[k] * fmin(fmax(y[k] > 0.0 ? f->upper[k] - value : value - f->lower[k], 0.0), 1.0);
-        loose += slack * slack;
+        add_residuals(y[k], value, f->lower[k], f->upper[k], &beyond, &loose);
         if (k >= n && y[k] != 0.0)
             for (int i = 0; i < n; i++) force[i] += y[k] * row[i];
     }

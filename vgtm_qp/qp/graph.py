@@ -152,7 +152,9 @@ class StepGraph:
 
 
 class StationSymbols:
-    """One station and its curve node as symbols: eqs. (32)-(39) at the station.
+    """One station and its curve node as symbols.
+
+    These are eqs. (32)-(39) at the station.
 
     Attributes
     ----------

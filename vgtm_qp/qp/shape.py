@@ -15,7 +15,9 @@ from vgtm_qp.qp.curve_rows import CurvePlacing, curve_function, point_function
 
 
 class CurveRows(NamedTuple):
-    """A curve at its K nodes and the rows over its D = 3 V + T coordinates, eqs. (32)-(36).
+    """A curve at its K nodes and the rows over its D = 3 V + T coordinates.
+
+    See eqs. (32)-(36).
 
     Attributes
     ----------

@@ -30,6 +30,15 @@ _INSTANT = 1e-9
 """Times that differ by less are the same, s."""
 
 
+def within(box: Box, values: Array, trust: Array) -> Box:
+    """Return the part of a box that is no further than `trust` from the values (n_a,), or else its nearest sides."""
+    lower, upper = box
+    return (
+        np.minimum(np.maximum(lower, values - trust), upper),
+        np.maximum(np.minimum(upper, values + trust), lower),
+    )
+
+
 class Limits(NamedTuple):
     """The box of the actuators after a step, and the limits that set its sides.
 

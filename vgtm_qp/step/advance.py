@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vgtm_qp.step.actuation import Actuation
+from vgtm_qp.step.actuation import Actuation, within
 from vgtm_qp.step.attempt import FURTHER, Attempt, Tracking
 from vgtm_qp.step.braking import ANY_RANK, Brakes, Braking
 from vgtm_qp.step.setup import TOO_LONG
@@ -161,8 +161,7 @@ class Advancer:
         if share < first:
             longest = min(_TRUST * self._arm.unit, _LONGER * self._step_limit)
             values, trust = self._actuation.values(state), share * longest / self._arm.levers / first
-            lower = np.minimum(np.maximum(lower, values - trust), upper)
-            upper = np.maximum(np.minimum(target.upper, values + trust), target.lower)
+            lower, upper = within((lower, upper), values, trust)
         piece = replace(target.part(share), lower=lower, upper=upper)
         return self._try(state, piece, dt, share, tracking=tracking)
 

@@ -70,9 +70,9 @@ class EndKinematics:
 
 
 class LengthRows:
-    """J d_rho - E d_a = rhs, eqs. (22)-(24) with the actuated members beside the fixed ones; see ``arm.MotionRows``.
+    """J d_rho - E d_a = rhs for the actuated members beside the fixed ones; see ``arm.MotionRows``.
 
-    J has the gradients (M, Q, 3); `rhs` (M,) is in m.
+    Eqs. (22)-(24). J has the gradients (M, Q, 3); `rhs` (M,) is in m.
     """
 
     def __init__(self, truss: Truss, gradient: Array, rhs: Array) -> None:
