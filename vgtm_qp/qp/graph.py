@@ -99,15 +99,16 @@ class StepGraph:
             frames = tip_frames(self.layout.arm, self._constants)
             self.tip_rotation = frames.rotations(self.X)
             _, spin = frames.at(self.Y)
-        error = tip_rows.error(rows, self.tip_position, self.tip_rotation, self.goal, self.turned)
         levers = self.table("levers", self.layout.tip_levers)
         unit, fineness = self.weights(self.layout.arm.unit, self.layout.arm.fineness)
-        self.tip_error = tip_rows.worth_closing(error, self.motion, levers, fineness)
+        (weight,) = self.weights(self.layout.weights.progress)
+        there = (self.tip_position, self.tip_rotation), (self.goal, self.turned), (self.velocity, self.spin)
+        self.tip_error, self.tip_rate, of_progress = tip_rows.along_path(
+            rows, *there, self.motion, levers, unit, fineness
+        )
         position = ca.DM(np.kron(tip.weights, np.eye(3)))
         self.tip_jacobian = tip_rows.combined(rows, position, spin, self.tip_rotation)
-        self.tip_rate = tip_rows.combined(rows, self.velocity, self.spin, self.tip_rotation)
-        (weight,) = self.weights(self.layout.weights.progress)
-        self.curvature = weight * tip_rows.progress_weight(self.tip_rate, levers, unit)
+        self.curvature = weight * of_progress
 
     def _curve(self) -> None:
         layout, stations = self.layout, self.layout.arm.stations

@@ -10,6 +10,9 @@ import casadi as ca
 from vgtm_qp.arrays import Array
 from vgtm_qp.errors import GoalError, nearest
 
+Pair = tuple[Any, Any]
+"""A position and a rotation, or their rates."""
+
 _ROWS = {
     "position": ("tip x", "tip y", "tip z"),
     "pointing": ("tip direction 1", "tip direction 2"),
@@ -188,6 +191,26 @@ def levers(rows: Sequence[str], unit_length: float) -> list[float]:
     return [1.0 if unit(row) == "m" else unit_length for row in rows]
 
 
+def along_path(
+    rows: Sequence[str],
+    tip: Pair,
+    goal: Pair,
+    rates: Pair,
+    motion: Any,
+    levers: Any,
+    unit: Any,
+    fineness: Any,
+) -> tuple[Any, Any, Any]:
+    """Return what the rows of a tip close (n_e, 1), their rate (n_e, 1) along the path, and the weight of the progress.
+
+    Tip and goal are positions (3, 1) and rotations (3, 3), rates the goal's velocity and spin (3, 1). For the other
+    arguments see :func:`worth_closing` and :func:`progress_weight`.
+    """
+    rate = combined(rows, *rates, tip[1])
+    closing = worth_closing(error(rows, *tip, *goal), motion, levers, fineness)
+    return closing, rate, progress_weight(rate, levers, unit)
+
+
 def tip_function(rows: Sequence[str], unit_length: float) -> ca.Function:
     """Return the rows of a tip as a function of numbers, for an arm of that unit, m.
 
@@ -199,12 +222,9 @@ def tip_function(rows: Sequence[str], unit_length: float) -> ca.Function:
     goal, turned = ca.SX.sym("goal", 3), ca.SX.sym("turned", 3, 3)
     velocity, spin = ca.SX.sym("velocity", 3), ca.SX.sym("spin", 3)
     motion = ca.SX.sym("motion")
-    rate, arms = combined(rows, velocity, spin, rotation), ca.DM(levers(rows, unit_length))
-    results = [
-        worth_closing(error(rows, position, rotation, goal, turned), motion, arms, min(1.0, unit_length)),
-        rate,
-        turned_axes(rows, rotation),
-        progress_weight(rate, arms, unit_length),
-    ]
+    of_arm = ca.DM(levers(rows, unit_length)), unit_length, min(1.0, unit_length)
+    pairs = (position, rotation), (goal, turned), (velocity, spin)
+    closing, rate, weight = along_path(rows, *pairs, motion, *of_arm)
+    results = [closing, rate, turned_axes(rows, rotation), weight]
     inputs = [position, rotation, goal, turned, velocity, spin, motion]
     return ca.Function("tip", inputs, [ca.densify(result) for result in results])

@@ -37,7 +37,7 @@ class RandomScene(NamedTuple):
 
 
 def random_scene(seed: int, number: int, *, steps: int = 30) -> RandomScene:
-    """Return scene `number` of a `seed`: always the same, whatever scenes were made before it."""
+    """Return scene `number` of a `seed`: the same but for last digits, whatever scenes were made before it."""
     random = np.random.default_rng([seed, number])
     truss = _truss(random)
     directed = bool(random.random() < 0.4)

@@ -83,12 +83,11 @@ def begin_function(layout: Layout) -> Bound:
     unit, fineness, weight = ca.vertsplit(
         ends.constant("weights", layout.arm.unit, layout.arm.fineness, layout.weights.progress)
     )
-    error = tip_rows.error(rows, ends.X @ ca.DM(tip.weights), ends.rotation, goal, turned)
-    rate = tip_rows.combined(rows, velocity, spin, ends.rotation)
-    position = ca.DM(np.kron(tip.weights, np.eye(3)))
-    curvature = weight * tip_rows.progress_weight(rate, levers, unit)
+    pairs = (ends.X @ ca.DM(tip.weights), ends.rotation), (goal, turned), (velocity, spin)
+    error, rate, of_progress = tip_rows.along_path(rows, *pairs, motion, levers, unit, fineness)
+    position, curvature = ca.DM(np.kron(tip.weights, np.eye(3))), weight * of_progress
     results = [
-        tip_rows.worth_closing(error, motion, levers, fineness),
+        error,
         rate,
         tip_rows.combined(rows, position, ends.spin, ends.rotation).T,
         curvature,
