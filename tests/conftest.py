@@ -31,7 +31,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         type=int,
         default=1,
         metavar="N",
-        help="Of the tests that draw random cases take one in N; the seed chooses which",
+        help="Of the tests that draw random cases take one in N, which the seed chooses, and those marked anew",
     )
 
 
@@ -86,8 +86,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def is_chosen(item: pytest.Item) -> bool:
+    """Return whether a test that draws random cases is one of those of the seed, or always chosen."""
     option = item.config.option
-    return (zlib.crc32(item.nodeid.encode()) + option.seed) % option.one_in == 0
+    return (
+        item.get_closest_marker("anew") is not None
+        or (zlib.crc32(item.nodeid.encode()) + option.seed) % option.one_in == 0
+    )
 
 
 @pytest.fixture

@@ -113,6 +113,7 @@ def test_serial_scenes_have_everything_that_a_problem_may_say_about_serial_arms(
         assert home >= scene.clearance.safe
 
 
+@pytest.mark.anew
 @pytest.mark.parametrize("arms", ["trusses", "serial"])
 def test_no_scene_of_a_new_seed_is_unsafe_or_ends_without_a_word(rng, arms):
     """Scenes that nobody has seen, by the independent certificate; every tenth without a compiler, too."""

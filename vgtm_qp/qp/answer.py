@@ -57,7 +57,7 @@ class Closed:
     q : configuration
     quantities : (M,)
     error : float
-        Greatest deviation of a quantity from its target value.
+        Bound of the deviations of the quantities from their target values.
     tip_position, tip_rotation : (3,), (3, 3)
     """
 

@@ -232,15 +232,15 @@ class FusedSolver:
     def _solution(self, x: Array, near: int, nodes: Array, vertices: Array) -> StepSolution:
         work, x = self.workspace, x.copy()
         count, first = work.actuators, work.size + work.first_near
-        pull = work.multipliers
+        multipliers = work.multipliers
         return record(
             StepSolution,
             nodes=nodes,
             actuators=x[:count],
             vertices=vertices,
             progress=x.item(-1),
-            actuator_multipliers=pull[:count].copy(),
-            clearance_multipliers=-pull[first : first + near] if near else _NO_NUMBERS,
+            actuator_multipliers=multipliers[:count].copy(),
+            clearance_multipliers=-multipliers[first : first + near] if near else _NO_NUMBERS,
             iterations=work.data.iterations,
             torsion=x[work.torsion : -1] if self.layout.torsion else _NO_NUMBERS,
             tip_slack=0.0,
