@@ -20,7 +20,6 @@ from vgtm_qp.bench import BaselineName, contestants, measure, report, scenes
 from vgtm_qp.bench.chart import plot_phases
 from vgtm_qp.bench.contestants import BASELINES, BarePseudoinverse, make_baseline
 from vgtm_qp.bench.fresh import measure_fresh, measure_start
-from vgtm_qp.bench.ipopt import NonlinearStep
 from vgtm_qp.bench.measure import Pairs, Spent, breakdown, run_alone, run_in_turn, timing
 from vgtm_qp.bench.tables import render
 from vgtm_qp.bench.tour import Goal, Tour, make_goals
@@ -320,16 +319,18 @@ def test_the_nonlinear_program_is_solved_within_its_limits_and_not_worse_than_th
     midway: tuple[Any, ...],
 ) -> None:
     problem, before, after, (_, goal) = midway
-    step = NonlinearStep(problem)
-    step.place(before)
-    assert step.step(goal)
-    tip, lengths = tip_and_lengths(problem, step.reached)
+    baseline = make_baseline("ipopt", problem, 5)
+    baseline.place(before)
+    assert baseline.step(goal)
+    assert isinstance(baseline, contestants.ResolverStep)
+    reached = baseline.resolver.state.nodes
+    tip, lengths = tip_and_lengths(problem, reached)
     setup = build_arm(problem)
     fixed, low, high = ~setup.arm.actuated, *setup.arm.stroke.T
     assert np.abs(lengths - before.quantities)[fixed].max() < 1e-9
     assert np.abs(tip - goal.pose.position).max() < 1e-9
     assert np.all((lengths > low - 1e-9) & (lengths < high + 1e-9))
-    assert setup.monitor.least(step.reached, after.time, among="obstacles")[0] > setup.safe - 1e-3
+    assert setup.monitor.least(reached, after.time, among="obstacles")[0] > setup.safe - 1e-3
 
     def cost(X: np.ndarray, lengths: np.ndarray) -> float:
         weights = problem.method.weights
@@ -338,7 +339,7 @@ def test_the_nonlinear_program_is_solved_within_its_limits_and_not_worse_than_th
         terms = (weights.node_rate, moved), (weights.actuator_rate, change), (weights.stroke_centring, home)
         return 0.5 * sum(weight * float(np.sum(values**2)) for weight, values in terms)
 
-    assert cost(step.reached, lengths) < cost(after.nodes, after.quantities) + 1e-6
+    assert cost(reached, lengths) < cost(after.nodes, after.quantities) + 1e-6
 
 
 @pytest.mark.parametrize("name", ["eq28-sparse", "curve", "osqp", "piqp"])

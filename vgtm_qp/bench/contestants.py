@@ -11,12 +11,12 @@ import numpy as np
 
 from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.bench import BaselineName
-from vgtm_qp.bench.ipopt import NonlinearStep
 from vgtm_qp.bench.peers import MinkStep, PinkStep
 from vgtm_qp.bench.tour import Goal
 from vgtm_qp.errors import SolverError
 from vgtm_qp.methods import Resolver, with_method
 from vgtm_qp.methods.conventional import DenseSolution
+from vgtm_qp.methods.ipopt import NonlinearResolver
 from vgtm_qp.methods.resolver import arm_without_curve
 from vgtm_qp.problem import Problem
 from vgtm_qp.step.state import State
@@ -69,12 +69,10 @@ class BarePseudoinverse:
 
 
 class ResolverStep:
-    """A resolver of the package: by another `method`, or by the problem's method with another `solver`."""
+    """A resolver of the package."""
 
-    def __init__(self, problem: Problem, *, method: str | None = None, solver: str | None = None) -> None:
-        changed = problem if method is None else with_method(problem, method)
-        changed = changed if solver is None else changed.replace({"method.solver": solver})
-        self.resolver: Resolver = Resolver(changed)
+    def __init__(self, resolver: Resolver) -> None:
+        self.resolver = resolver
 
     def place(self, state: State) -> None:
         """See :class:`Contestant`."""
@@ -89,21 +87,27 @@ class ResolverStep:
         return step.status is StepStatus.REACHED
 
 
+def _by_method(method: str, problem: Problem) -> ResolverStep:
+    return ResolverStep(Resolver(with_method(problem, method)))
+
+
+def _by_solver(solver: str, problem: Problem) -> ResolverStep:
+    return ResolverStep(Resolver(problem.replace({"method.solver": solver})))
+
+
+def _by_ipopt(problem: Problem) -> ResolverStep:
+    return ResolverStep(NonlinearResolver(problem))
+
+
 BASELINES: dict[BaselineName, Baseline] = {
     "eq28": Baseline("eq. (28), dense pseudoinverse alone", 100, BarePseudoinverse),
-    "eq28-sparse": Baseline(
-        "eq. (28), banded",
-        1000,
-        partial(ResolverStep, method="pseudoinverse-sparse"),
-    ),
+    "eq28-sparse": Baseline("eq. (28), banded", 1000, partial(_by_method, "pseudoinverse-sparse")),
     "curve": Baseline(
-        "curve by pseudoinverse, bays after it",
-        1000,
-        partial(ResolverStep, method="curve-pseudoinverse"),
+        "curve by pseudoinverse, bays after it", 1000, partial(_by_method, "curve-pseudoinverse")
     ),
-    "ipopt": Baseline("one nonlinear program a step, IPOPT", 20, NonlinearStep),
-    "osqp": Baseline("the same QPs, OSQP", 200, partial(ResolverStep, solver="osqp")),
-    "piqp": Baseline("the same QPs, PIQP", 200, partial(ResolverStep, solver="piqp")),
+    "ipopt": Baseline("nonlinear programs until clearances are exact, IPOPT", 20, _by_ipopt),
+    "osqp": Baseline("the same QPs, OSQP", 200, partial(_by_solver, "osqp")),
+    "piqp": Baseline("the same QPs, PIQP", 200, partial(_by_solver, "piqp")),
     "mink": Baseline("the same tip, limits and distances as a QP on MuJoCo, mink", 1000, MinkStep),
     "pink": Baseline("the same tip, limits and distances as a QP on Pinocchio, pink", 1000, PinkStep),
 }

@@ -59,7 +59,7 @@ class MethodResolver(Resolver, ABC):
             nodes = self.setup.arm.nodes(moved.q)
             self._refuse_breakdown(nodes, path, start, end)
         except (SolverError, CurveError, np.linalg.LinAlgError) as error:
-            return Step(StepStatus.BLOCKED, 0.0, self.state, f"step {self._steps}: {error}", 0)
+            return Step.stopped(self.state, f"step {self._steps}: {error}", 0)
         kinematics, before = self.setup.kinematics, self.state
         kinematics.evaluate(moved.q)
         quantities = frozen(kinematics.quantities)

@@ -11,11 +11,13 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from vgtm_qp.arrays import Array
-from vgtm_qp.qp.answer import Accuracy, Closed
-from vgtm_qp.qp.numbers import beyond, norm
+from vgtm_qp.arrays import Array, record
+from vgtm_qp.qp.answer import Accuracy, Closed, StepSolution
+from vgtm_qp.qp.numbers import ClearanceRows, beyond, norm
 from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.setup import Setup
+from vgtm_qp.step.state import State
+from vgtm_qp.step.step import WHOLE, Step, StepStatus
 from vgtm_qp.step.target import Target
 
 LOOSER = 10.0
@@ -29,7 +31,14 @@ ROUNDING = 64.0 * float(np.finfo(float).eps)
 
 
 class Acceptance:
-    """Checks states of one arm, settled to an accuracy, for their quantities, limits and goals."""
+    """Checks states of one arm, settled to an accuracy, for their quantities, limits and goals.
+
+    Attributes
+    ----------
+    accuracy : Accuracy
+    gives_way : bool
+        Whether stations may leave the curve where they block the arm.
+    """
 
     def __init__(self, setup: Setup, accuracy: Accuracy) -> None:
         self._arm, self._kinematics, self._task = setup.arm, setup.kinematics, setup.task
@@ -39,6 +48,34 @@ class Acceptance:
         self._base: slice | NDArray[np.int64] = slice(len(base)) if is_first else base
         self._least, self._greatest = setup.arm.home_quantities.copy(), setup.arm.home_quantities.copy()
         self._member, self._tip = LOOSER * accuracy.member, LOOSER * accuracy.tip
+        self.accuracy, self.gives_way = accuracy, setup.elastic is not None
+
+    def gave_way(self, gap: float) -> bool:
+        """Return whether stations with that gap, m, are off the curve although tracking is exact."""
+        return self.gives_way and not gap <= self.accuracy.tracking
+
+    def passed(
+        self,
+        state: State,
+        progress: float,
+        gap: float,
+        qps: int,
+        solution: StepSolution | None,
+        rows: ClearanceRows | None,
+    ) -> Step:
+        """Return the step to a proven `state` with the `gap` of its stations; the rest are its fields of the QPs."""
+        return record(
+            Step,
+            status=StepStatus.REACHED if progress >= WHOLE else StepStatus.SLOWED,
+            progress=progress,
+            state=state,
+            reason="",
+            qps=qps,
+            gave_way=self.gave_way(gap),
+            gap=gap,
+            solution=solution,
+            rows=rows,
+        )
 
     def flaw(
         self,

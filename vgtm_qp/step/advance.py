@@ -77,7 +77,7 @@ class Advancer:
         best: Advance | None = None
         too_long, before = "", self._attempt.qps
         if self._may_be_usual and (usual := self._attempt.usual(state, target)) is not None:
-            held = _LEAST_HELD if self._attempt.gives_way else 0.0
+            held = _LEAST_HELD if self._attempt.acceptance.gives_way else 0.0
             if usual.progress >= (held if self._tip_mode == "scaled" else WHOLE):
                 return Advance(usual, None)
         for found in self._attempts(state, target, dt, smallest):
@@ -97,7 +97,7 @@ class Advancer:
         With a limit on the displacement of nodes, pieces longer than that limit are not tried.
         """
         is_slow, first = self._tip_mode == "scaled", self.first_share(target)
-        if is_slow and self._attempt.gives_way and self._actuation.starts_at_once:
+        if is_slow and self._attempt.acceptance.gives_way and self._actuation.starts_at_once:
             yield from self._held_or_free(state, target, dt, first, smallest)
         else:
             yield from self._pieces(state, target, dt, first, smallest if is_slow else first, Tracking.EITHER)

@@ -6,26 +6,23 @@ from collections.abc import Sequence
 from dataclasses import replace
 from enum import Enum
 from time import perf_counter
-from typing import Any
 
 import numpy as np
 
-from vgtm_qp.arrays import Array, record
-from vgtm_qp.errors import CurveError, EvaluationError, SolverError
-from vgtm_qp.qp.answer import Accuracy, Closed, Move, StepSolution
+from vgtm_qp.arrays import Array
+from vgtm_qp.errors import CurveError, SolverError
+from vgtm_qp.qp.answer import Accuracy, Closed, Move
 from vgtm_qp.qp.numbers import ClearanceRows
-from vgtm_qp.qp.residual import CONTRADICTION, AnswerError, FailedStepError, InfeasibleStepError
 from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.acceptance import Acceptance
 from vgtm_qp.step.actuation import Actuation
 from vgtm_qp.step.driver import (
     FREE_QPS,
     MOST_QPS,
+    NO_CONVERGENCE,
     PHASES,
     Begun,
     Driver,
-    Lost,
-    Passage,
     can_drive,
     is_cut_short,
 )
@@ -33,14 +30,12 @@ from vgtm_qp.step.engine import Engine
 from vgtm_qp.step.separation import RECOVERY, Separation
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import Shortfall, State
-from vgtm_qp.step.step import WHOLE, Step, StepStatus
+from vgtm_qp.step.step import WHOLE, Step
 from vgtm_qp.step.step_data import DEVIATION, LEAP, MOTION_MARGIN, SINGULAR
 from vgtm_qp.step.target import QPInput, Target
 
 _MOST_FRACTIONS = 8
 """Greatest number of times between two states for which a QP has rows."""
-
-_NO_CONVERGENCE = "no convergence"
 
 _SETTLING = 5e-3
 """Tip error after a QP, over the arm's length, above which another QP is solved."""
@@ -118,11 +113,6 @@ class Attempt:
         """Go on with the curve of another `setup` of the arm."""
         self._setup, self._can_drive = setup, can_drive(setup)
 
-    @property
-    def gives_way(self) -> bool:
-        """Whether stations may leave the curve where they block the arm."""
-        return self._setup.elastic is not None
-
     def usual(self, state: State, target: Target) -> Step | None:
         """Return the step of :meth:`run` if it is a usual one, in one call; what was found out is kept for ``run``."""
         engine, self._tried = self._setup.engine, None
@@ -185,7 +175,7 @@ class Attempt:
                     step = self._run(state, target, asked, reach, short, gain, engine)
             except CurveError as error:
                 # A trial curve may have no frame; that of a shorter piece may have one.
-                step = Step(StepStatus.BLOCKED, 0.0, state, str(error), 1, True)
+                step = Step.stopped(state, str(error), 1, solver_failed=True)
             if step.moved:
                 break
         return step
@@ -194,26 +184,14 @@ class Attempt:
         """Return the step in one call, or its beginning if it needs further QPs; None if it is no usual one."""
         driver = self._drivers.get(engine)
         if driver is None:
-            assert engine.stepper is not None
-            driver = self._drivers[engine] = Driver(
-                self._setup, engine.stepper, self.accuracy, self.separation
-            )
+            driver = self._drivers[engine] = Driver(self._setup, engine, self.acceptance, self.separation)
             self.phases.join(PHASES, driver.spent)
-        taken = driver.take(state, target, share)
-        if taken is None or isinstance(taken, Begun):
+        driven = driver.take(state, target, share)
+        if isinstance(driven, Step):
+            self.qps += driven.qps
+        else:
             self.phases.start()
-            return taken
-        qps = MOST_QPS if isinstance(taken, Lost) else taken.qps
-        self.qps += qps
-        if isinstance(taken, Passage):
-            return self._accepted(taken.state, taken.progress, taken.gap, qps, taken.solution, taken.rows)
-        of_qps: dict[str, Any] = {"qps": qps, "solution": taken.solution, "rows": taken.rows}
-        if isinstance(taken, Lost):
-            return Step(StepStatus.BLOCKED, 0.0, state, _NO_CONVERGENCE, **of_qps)
-        asked, error = taken.asked, InfeasibleStepError(CONTRADICTION)
-        error.build = lambda: engine.qp(asked)
-        reason, failure, _ = _reason(error)
-        return Step(StepStatus.BLOCKED, 0.0, state, reason, failure=failure, **of_qps)
+        return driven
 
     def _recovery(self, short: Shortfall) -> float:
         """Return the distance by which pairs that are too near are driven apart, m."""
@@ -222,11 +200,7 @@ class Attempt:
     def with_gap(self, step: Step) -> Step:
         """Return a step with the gap between curve and stations in its state."""
         gap = self._setup.gap_of(step.state)
-        return replace(step, gap=gap, gave_way=self._gave_way(gap))
-
-    def _gave_way(self, gap: float) -> bool:
-        """Return whether stations with that gap are off the curve although tracking is exact."""
-        return self.gives_way and not gap <= self.accuracy.tracking
+        return replace(step, gap=gap, gave_way=self.acceptance.gave_way(gap))
 
     def first_input(self, state: State, target: Target, share: float) -> QPInput:
         """Return the input of the first QP of a step from `state`; see :meth:`run`."""
@@ -270,9 +244,9 @@ class Attempt:
         move: Move | None = None
         self.qps += begun - 1
 
-        def blocked(reason: str, failure: FailedStepError | None = None, solver_failed: bool = False) -> Step:
-            kept = Step(StepStatus.BLOCKED, 0.0, state, reason, count, solver_failed)
-            return replace(kept, solution=first and first.solution, rows=rows, failure=failure)
+        def blocked(reason: str, *, solver_failed: bool = False) -> Step:
+            of_qps = count, first and first.solution, rows
+            return Step.stopped(state, reason, *of_qps, solver_failed=solver_failed)
 
         for count in range(begun, MOST_QPS + 1):
             if count > FREE_QPS and covered == 1.0 and first is not None and is_cut_short(self._setup, first):
@@ -293,7 +267,7 @@ class Attempt:
                     begin.move if isinstance(begin, Begun) else engine.move(begin, self.accuracy, phases.add)
                 )
             except SolverError as error:
-                return blocked(*_reason(error))
+                return Step.failed(state, error, count, first and first.solution, rows)
             finally:
                 phases.add("correction")
             if first is None:
@@ -328,11 +302,11 @@ class Attempt:
             if report.certified:
                 then = state.next(self._arm, target.duration, closed, vertices, move.torsion, after)
                 progress = covered * move.progress
-                return self._accepted(then, progress, gap, count, first.solution, rows)
+                return self.acceptance.passed(then, progress, gap, count, first.solution, rows)
             fractions.extend(s for s in report.failing_parameters() if s not in fractions)
             if len(fractions) > _MOST_FRACTIONS:
                 return blocked("clearance between the states")
-        return blocked(_NO_CONVERGENCE)
+        return blocked(NO_CONVERGENCE)
 
     def _furthest(self, q: Array, target: Target) -> Array | None:
         """Return ``Arm.furthest`` within the boxes of a target; None if the base moves."""
@@ -352,29 +326,6 @@ class Attempt:
         if not self.separation.deviation(state.q, q) < DEVIATION * self._arm.height:
             return "the arm turns too far in one step"
         return self._too_long(self._arm.nodes(q) - state.nodes) if self._has_limit else ""
-
-    def _accepted(
-        self,
-        state: State,
-        progress: float,
-        gap: float,
-        qps: int,
-        solution: StepSolution | None,
-        rows: ClearanceRows | None,
-    ) -> Step:
-        """Return the step to a proven `state` with the `gap` of its stations, and its fields of the QPs."""
-        return record(
-            Step,
-            status=StepStatus.REACHED if progress >= WHOLE else StepStatus.SLOWED,
-            progress=progress,
-            state=state,
-            reason="",
-            qps=qps,
-            gave_way=self._gave_way(gap),
-            gap=gap,
-            solution=solution,
-            rows=rows,
-        )
 
     def _flaw(self, state: State, target: Target, move: Move, closed: Closed) -> str:
         """Return the flaw of the configuration of a `move` from `state`, computed again, or nothing."""
@@ -402,12 +353,3 @@ def _beginning(
         return None, None, 1.0, target, 1
     covered = begin.covered
     return begin.first, begin.rows, covered, target if covered == 1.0 else target.part(covered), begin.qps
-
-
-def _reason(error: SolverError) -> tuple[str, FailedStepError | None, bool]:
-    """Return why an error of a QP ends an attempt, that error if it carries the QP, and whether the solver failed."""
-    if isinstance(error, AnswerError):
-        return str(error), error, True
-    if isinstance(error, InfeasibleStepError):
-        return "no displacement keeps all limits and clearances", error, False
-    return str(error), None, isinstance(error, EvaluationError)

@@ -19,13 +19,16 @@ from vgtm_qp.arrays import record
 from vgtm_qp.geometry.pairs import Pair
 from vgtm_qp.geometry.watch import Watch
 from vgtm_qp.native import Code
-from vgtm_qp.qp.answer import Accuracy, Move, StepSolution
+from vgtm_qp.qp.answer import Move, StepSolution
 from vgtm_qp.qp.numbers import ClearanceRows
-from vgtm_qp.qp.stepper import Corrector, Stepper
+from vgtm_qp.qp.residual import CONTRADICTION, InfeasibleStepError
+from vgtm_qp.qp.stepper import Corrector
+from vgtm_qp.step.acceptance import Acceptance
+from vgtm_qp.step.engine import Engine
 from vgtm_qp.step.separation import Separation
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import State
-from vgtm_qp.step.step import WHOLE
+from vgtm_qp.step.step import WHOLE, Step
 from vgtm_qp.step.step_data import StepData
 from vgtm_qp.step.target import QPInput, Target, base_frame
 
@@ -34,6 +37,8 @@ FREE_QPS = 3
 
 MOST_QPS = 6
 """Greatest number of QPs: the last ones start anew from the first answer, and go no further than it."""
+
+NO_CONVERGENCE = "no convergence"
 
 _NOTHING = 1e-9
 """Progress of a QP below which its corrections may go further than the QP."""
@@ -51,17 +56,6 @@ PHASES = "distance", "qp", "acceptance"
 """Parts of a step whose times are known."""
 
 _NO_ROWS = ClearanceRows()
-
-
-class Passage(NamedTuple):
-    """A step that was taken: state, progress and gap, answer and rows of its first QP, number of QPs; see ``Step``."""
-
-    state: State
-    progress: float
-    gap: float
-    solution: StepSolution
-    rows: ClearanceRows
-    qps: int = 1
 
 
 class Begun(NamedTuple):
@@ -89,25 +83,6 @@ class Begun(NamedTuple):
     covered: float = 1.0
 
 
-class Lost(NamedTuple):
-    """A step whose QPs, all that there may be, did not converge; the answer and the rows of the first one."""
-
-    solution: StepSolution
-    rows: ClearanceRows
-
-
-class Denied(NamedTuple):
-    """A step whose QP of that number has no answer: its input, and answer and rows of the first one if that has."""
-
-    asked: QPInput
-    qps: int
-    solution: StepSolution | None = None
-    rows: ClearanceRows | None = None
-
-
-Taken = Passage | Begun | Lost | Denied
-
-
 def can_drive(setup: Setup) -> bool:
     """Return whether usual steps of an arm can be taken in one call, if its ``Arm.arithmetic`` is known."""
     layout = setup.layout
@@ -132,20 +107,22 @@ class Driver:
 
     _arrays: StepData
 
-    def __init__(self, setup: Setup, solver: Stepper, accuracy: Accuracy, separation: Separation) -> None:
-        self._setup, self._accuracy, self._separation = setup, accuracy, separation
-        self._solver, self._layout = solver, solver.layout
-        self._work, self._known = solver.workspace, setup.arm.arithmetic()
+    def __init__(self, setup: Setup, engine: Engine, acceptance: Acceptance, separation: Separation) -> None:
+        assert engine.stepper is not None
+        self._setup, self._acceptance, self._separation = setup, acceptance, separation
+        self._engine, self._solver, self._layout = engine, engine.stepper, engine.layout
+        self._work, self._known = self._solver.workspace, setup.arm.arithmetic()
         self._started = False
         self._held: State | None = None
         self._watch: Watch | None = None
         self.spent = np.zeros(len(PHASES))
         self._moves = setup.base_motion is not None
 
-    def take(self, state: State, target: Target, share: float) -> Taken | None:
+    def take(self, state: State, target: Target, share: float) -> Step | Begun | None:
         """Return the step from `state`, in which no pair is too near, to the end of the target's piece of path.
 
-        The motion of the step before, times `share`, predicts this one. None if nothing is known of the step.
+        The motion of the step before, times `share`, predicts this one. If the step is no usual one, its beginning is
+        returned, or None if nothing is known of it.
         """
         setup, work = self._setup, self._work
         if (
@@ -180,12 +157,13 @@ class Driver:
         if code in _AGAIN or code == Code.NOT_PROVEN:
             first = self._solver.led(is_settled=bool(data.settled))
             return self.corrected(state, target, Begun(first, first, self._rows(), data.reach), code)
-        return _denied(state, target, share, self._rows()) if code == Code.INFEASIBLE else None
+        return self._denied(state, target, share) if code == Code.INFEASIBLE else None
 
     def _start(self, known: Arithmetic) -> None:
         """Allocate what the call needs."""
         pace = {**self._separation.pace, "spent": self.spent}
-        self._arrays = StepData(self._setup, self._layout, self._work, known, self._accuracy, **pace)
+        accuracy = self._acceptance.accuracy
+        self._arrays = StepData(self._setup, self._layout, self._work, known, accuracy, **pace)
         self._started = True
 
     def _called(self, call: Callable[[], int]) -> int:
@@ -208,7 +186,7 @@ class Driver:
             fcl.refused += data.asked_for - data.proven
         return code
 
-    def corrected(self, state: State, target: Target, begun: Begun, code: int) -> Taken:
+    def corrected(self, state: State, target: Target, begun: Begun, code: int) -> Step | Begun:
         """Return the step by further QPs after the first one, which ended with `code`; its beginning if unusual."""
         first, covered, corrector = begun.first, 1.0, self._solver.corrector
         if code == Code.NOT_PROVEN or corrector is None:
@@ -222,24 +200,22 @@ class Driver:
             self._solver.draw(state.control_vertices, None)
             code = self._called(self._arrays.correct)
             if code == Code.DONE:
-                found = self._passage(state, target)
-                progress = covered * found.progress
-                return Passage(found.state, progress, found.gap, first.solution, begun.rows, qps)
+                return self._passage(state, target, begun._replace(qps=qps, covered=covered))
             if code not in _AGAIN:
-                return self._left(corrector, target, begun, qps, covered, code)
-        return Lost(first.solution, begun.rows)
+                return self._left(corrector, state, target, begun._replace(covered=covered), qps, code)
+        return Step.stopped(state, NO_CONVERGENCE, MOST_QPS, first.solution, begun.rows)
 
     def _left(
-        self, corrector: Corrector, target: Target, begun: Begun, qps: int, covered: float, code: int
-    ) -> Begun | Denied:
+        self, corrector: Corrector, state: State, target: Target, begun: Begun, qps: int, code: int
+    ) -> Step | Begun:
         """Return what is left to an attempt after QPs of which the last ended with `code`: a proof, or that QP."""
         if code == Code.NOT_PROVEN:
             move = self._solver.led(is_settled=True)
         else:
             # Where the QP before it led, as far as this one knows.
             move, qps = Move(begun.first.solution, *corrector.point(), 0.0, None), qps - 1
-        begun = begun._replace(move=move, reach=self._arrays.data.reach, qps=qps, covered=covered)
-        return _corrects_nothing(target, begun, self._rows()) if code == Code.INFEASIBLE else begun
+        begun = begun._replace(move=move, reach=self._arrays.data.reach, qps=qps)
+        return self._corrects_nothing(state, target, begun) if code == Code.INFEASIBLE else begun
 
     def _aim_at(self, target: Target, progress: float) -> None:
         """Write the goal at a progress along the `target`."""
@@ -254,7 +230,7 @@ class Driver:
         self._solver.draw(state.control_vertices, target.vertex_goals)
         if self._layout.general is not None:
             self._solver.bend(state.torsion, base_frame(self._setup.arm, target.base))
-        self._solver.aim(self._accuracy)
+        self._solver.aim(self._acceptance.accuracy)
         inputs[4][:], inputs[5][:] = target.lower, target.upper
         self._aim_at(target, 0.0)
         if state is not self._held:
@@ -280,14 +256,13 @@ class Driver:
         if len(self._layout.tracked):
             self._arrays.base_normal[:] = base_frame(arm, pose)[:, 2]
 
-    def _passage(self, state: State, target: Target) -> Passage:
-        """Return the step that the call took."""
+    def _passage(self, state: State, target: Target, begun: Begun | None = None) -> Step:
+        """Return the step that the call took, after the QPs with which it had `begun`."""
         data, work, layout = self._arrays.data, self._work, self._layout
         block = self._arrays.after.copy()
         block.setflags(write=False)
         of_q, of_nodes, of_vertices, of_values, of_motion, of_rates, of_tip = self._arrays.parts
         q, tip = block[of_q].reshape(work.shape), block[of_tip]
-        progress, gap = work.data.reached, data.gap
         torsion = work.torsions.copy() if layout.torsion else state.torsion
         time, late = state.after(target.duration)
         then = record(
@@ -308,9 +283,11 @@ class Driver:
         self._held = None
         self._arrays.before[:] = block[: len(self._arrays.before)]
         self._held = then
-        return Passage(
-            then, progress, gap if layout.tracked.size else np.nan, self._solver.answered(), self._rows()
-        )
+        progress, gap = work.data.reached, data.gap if layout.tracked.size else np.nan
+        if begun is None:
+            return self._acceptance.passed(then, progress, gap, 1, self._solver.answered(), self._rows())
+        progress *= begun.covered
+        return self._acceptance.passed(then, progress, gap, begun.qps, begun.first.solution, begun.rows)
 
     def _ask(self) -> None:
         """Have FCL answer the questions of this round."""
@@ -339,18 +316,31 @@ class Driver:
             *work.near(near), name, data.proven, (data.asked_for if data.asks else near) - data.proven
         )
 
+    def _denied(self, state: State, target: Target, share: float) -> Step | None:
+        """Return the step whose first QP has no answer; None if it may have one without the margin."""
+        rows = self._rows()
+        if len(rows) and rows.lower.max() > 0.0:
+            return None
+        at, curve = state.q + 0.5 * share * state.motion, (state.control_vertices, state.torsion)
+        asked = QPInput(state.q, at, *curve, target, target.goal(0.0), 0.0, rows, True)
+        return self._failed(state, asked, 1)
 
-def _denied(state: State, target: Target, share: float, rows: ClearanceRows) -> Denied | None:
-    """Return the step whose first QP, with these `rows`, has no answer; None if it may have one without the margin."""
-    if len(rows) and rows.lower.max() > 0.0:
-        return None
-    at, curve = state.q + 0.5 * share * state.motion, (state.control_vertices, state.torsion)
-    return Denied(QPInput(state.q, at, *curve, target, target.goal(0.0), 0.0, rows, True), 1)
+    def _corrects_nothing(self, state: State, target: Target, begun: Begun) -> Step:
+        """Return the step whose next QP after its beginning has no answer."""
+        move, target = begun.move, target if begun.covered == 1.0 else target.part(begun.covered)
+        at = move.q, move.q, move.vertices, move.torsion
+        asked = QPInput(*at, target, target.goal(move.progress), move.progress, self._rows(), False)
+        return self._failed(state, asked, begun.qps + 1, begun.first.solution, begun.rows)
 
-
-def _corrects_nothing(target: Target, begun: Begun, rows: ClearanceRows) -> Denied:
-    """Return the step whose next QP after its beginning, with these `rows`, has no answer."""
-    move, target = begun.move, target if begun.covered == 1.0 else target.part(begun.covered)
-    point = move.q, move.q, move.vertices, move.torsion
-    asked = QPInput(*point, target, target.goal(move.progress), move.progress, rows, False)
-    return Denied(asked, begun.qps + 1, begun.first.solution, begun.rows)
+    def _failed(
+        self,
+        state: State,
+        asked: QPInput,
+        qps: int,
+        solution: StepSolution | None = None,
+        rows: ClearanceRows | None = None,
+    ) -> Step:
+        """Return the step whose last QP, that which was `asked`, has no answer."""
+        error = InfeasibleStepError(CONTRADICTION)
+        error.build = lambda: self._engine.qp(asked)
+        return Step.failed(state, error, qps, solution, rows)

@@ -27,7 +27,7 @@ from vgtm_qp.step.separation import Separation
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.shaping import Shaping
 from vgtm_qp.step.state import Shortfall, State, frozen
-from vgtm_qp.step.step import Step, StepStatus
+from vgtm_qp.step.step import Step
 from vgtm_qp.step.stops import Stop, explain, struck
 from vgtm_qp.step.task import duration
 
@@ -160,7 +160,7 @@ class QPResolver(Resolver, serves="qp"):
             braking = self._known_braking()
             if braking is None:
                 return None
-            step = self._brake(braking, path, start, end, Step(StepStatus.BLOCKED, 0.0, self.state, "", 0))
+            step = self._brake(braking, path, start, end, Step.stopped(self.state, "", 0))
             return self._told(step, path, start, end)
 
     def _braking_until_jam(self) -> Braking | None:

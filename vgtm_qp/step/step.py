@@ -10,11 +10,12 @@ from functools import cached_property
 import numpy as np
 
 from vgtm_qp.arrays import record
+from vgtm_qp.errors import EvaluationError, SolverError
 from vgtm_qp.notebook import html_table
 from vgtm_qp.qp.answer import StepSolution
 from vgtm_qp.qp.full import StepQP
 from vgtm_qp.qp.numbers import ClearanceRows
-from vgtm_qp.qp.residual import FailedStepError
+from vgtm_qp.qp.residual import AnswerError, FailedStepError, InfeasibleStepError
 from vgtm_qp.step.actuation import Limits
 from vgtm_qp.step.state import State
 
@@ -81,6 +82,54 @@ class Step:
     rows: ClearanceRows | None = None
     limits: Limits | None = None
     failure: FailedStepError | None = None
+
+    @classmethod
+    def stopped(
+        cls,
+        state: State,
+        reason: str,
+        qps: int,
+        solution: StepSolution | None = None,
+        rows: ClearanceRows | None = None,
+        *,
+        failure: FailedStepError | None = None,
+        solver_failed: bool = False,
+    ) -> Step:
+        """Return a blocked step that leaves the arm in its `state`."""
+        return cls(
+            StepStatus.BLOCKED,
+            0.0,
+            state,
+            reason,
+            qps,
+            solver_failed,
+            solution=solution,
+            rows=rows,
+            failure=failure,
+        )
+
+    @classmethod
+    def failed(
+        cls,
+        state: State,
+        error: SolverError,
+        qps: int,
+        solution: StepSolution | None,
+        rows: ClearanceRows | None,
+    ) -> Step:
+        """Return the step that a QP without an answer has blocked."""
+        reason = str(error)
+        if isinstance(error, InfeasibleStepError) and not isinstance(error, AnswerError):
+            reason = "no displacement keeps all limits and clearances"
+        return cls.stopped(
+            state,
+            reason,
+            qps,
+            solution,
+            rows,
+            failure=error if isinstance(error, FailedStepError) else None,
+            solver_failed=isinstance(error, AnswerError | EvaluationError),
+        )
 
     def __str__(self) -> str:
         """Return one line: status, progress, time, and the rows that held the arm back."""
