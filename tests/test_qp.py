@@ -21,11 +21,11 @@ from vgtm_qp.problem.method import Weights
 from vgtm_qp.qp.answer import StepSolution
 from vgtm_qp.qp.condensed import CondensedSolver
 from vgtm_qp.qp.daqp import DAQP
-from vgtm_qp.qp.dense import DenseAnswer, DenseQP, check, residuals
+from vgtm_qp.qp.dense import DenseAnswer, DenseQP, DenseSolver, answered, residuals
 from vgtm_qp.qp.full import FullBuilder
 from vgtm_qp.qp.linearise import Linearisation, StepInput
 from vgtm_qp.qp.numbers import ClearanceRows, Legs, StepNumbers
-from vgtm_qp.qp.residual import InfeasibleStepError
+from vgtm_qp.qp.residual import InfeasibleStepError, refuse_large
 from vgtm_qp.qp.solvers import available_solvers, make_solver
 from vgtm_qp.rows.tip import TipGoal
 
@@ -432,7 +432,7 @@ def test_a_maneuver_takes_no_more_steps_for_its_solver(name):
     assert maneuver.certificate.ok
 
 
-class Spoilt:
+class Spoilt(DenseSolver):
     """A solver that says of any answer that it solved the QP."""
 
     accuracy = 1e-10
@@ -479,8 +479,8 @@ def test_a_feasible_answer_that_is_not_optimal_is_refused():
     answer = DenseAnswer(x, np.concatenate([of_bounds, np.zeros(2)]), 1, "any")
     assert residuals(answer, qp)[0] == 0.0
     with pytest.raises(SolverError, match="dual residual"):
-        check(answer, qp)
-    check(DAQP.ask(qp), qp)
+        refuse_large(*residuals(answer, qp), answer.status)
+    answered(DAQP, qp)
 
 
 def test_garbage_from_a_library_is_refused(monkeypatch):

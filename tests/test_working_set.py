@@ -13,14 +13,14 @@ from vgtm_qp.compiled import compiler
 from vgtm_qp.errors import SolverError
 from vgtm_qp.native import building
 from vgtm_qp.qp.daqp import DAQP
-from vgtm_qp.qp.dense import DenseAnswer, DenseQP
+from vgtm_qp.qp.dense import DenseAnswer, DenseQP, DenseSolver
 from vgtm_qp.qp.fused import FusedSolver
 from vgtm_qp.qp.residual import AnswerError, InfeasibleStepError
 
 pytestmark = pytest.mark.skipif(compiler() is None, reason="no C compiler")
 
 
-class Listening:
+class Listening(DenseSolver):
     """DAQP by Python, which keeps the last QP that it was asked and its answer."""
 
     accuracy = DAQP.accuracy

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from vgtm_qp.arrays import Array
 from vgtm_qp.qp.answer import StepSolution
 from vgtm_qp.qp.daqp import DAQP, fitted
-from vgtm_qp.qp.dense import EQUALITY, DenseQP, DenseSolver, check
+from vgtm_qp.qp.dense import EQUALITY, DenseQP, DenseSolver, answered
 from vgtm_qp.qp.full import FullBuilder, StepQP
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.numbers import UNBOUNDED, StepNumbers
@@ -69,8 +69,7 @@ class CondensedSolver:
         tips = size + len(bounded)
         sense[tips : tips + len(builder.tip_rows)] = EQUALITY
         dense = DenseQP(hessian, gradient, constraint, lower, upper, sense)
-        answer = self._solver.ask(dense)
-        check(answer, dense)
+        answer = answered(self._solver, dense)
         y, w = np.zeros(len(qp.row_lower)), np.zeros(builder.size)
         y[rows] = answer.multipliers[tips:]
         w[bounded] = answer.multipliers[size:tips]

@@ -9,8 +9,10 @@ from vgtm_qp.qp.dense import DenseAnswer, DenseQP, DenseSolver
 from vgtm_qp.qp.residual import CONTRADICTION, InfeasibleStepError
 
 
-class Daqp:
-    """See :class:`vgtm_qp.qp.dense.DenseSolver`; for arms of a `fineness`. Its answers are not checked yet."""
+class Daqp(DenseSolver):
+    """DAQP, for arms of a `fineness`."""
+
+    is_in_c = True
 
     def __init__(self, fineness: float = 1.0) -> None:
         self.accuracy = 1e-10 * fineness
@@ -33,4 +35,4 @@ DAQP = Daqp()
 
 def fitted(solver: DenseSolver, fineness: float) -> DenseSolver:
     """Return the default solver with the accuracy that arms of a `fineness` need; any other one as it is."""
-    return Daqp(fineness) if solver is DAQP else solver
+    return Daqp(fineness) if solver.is_in_c else solver

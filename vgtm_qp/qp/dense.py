@@ -77,20 +77,22 @@ class DenseSolver(Protocol):
     ----------
     accuracy : float
         Greatest violation of a row by its answers, m or rad.
+    is_in_c : bool
+        Whether ``native/qp.c`` calls the same solver by itself.
     """
 
     accuracy: float
+    is_in_c: bool = False
 
     def ask(self, qp: DenseQP) -> DenseAnswer:
-        """Return the answer, in new arrays.
+        """Return the answer, in new arrays; who asks checks it, see :func:`answered`.
 
         Raises
         ------
         InfeasibleStepError
             The rows contradict one another.
         AnswerError
-            The solver failed. An answer of :class:`vgtm_qp.qp.daqp.Daqp` without this error is not checked
-            yet.
+            The solver failed.
         """
         ...
 
@@ -113,15 +115,17 @@ def residuals(answer: DenseAnswer, qp: DenseQP) -> tuple[float, float]:
     return norm(beyond(values, qp.lower, qp.upper)), dual
 
 
-def check(answer: DenseAnswer, qp: DenseQP) -> None:
-    """Refuse an answer whose residuals are too large.
+def answered(solver: DenseSolver, qp: DenseQP) -> DenseAnswer:
+    """Return the answer of a solver, whatever its status, if its residuals are small enough.
 
     Raises
     ------
-    AnswerError
-        See :func:`vgtm_qp.qp.residual.refuse_large`.
+    InfeasibleStepError, AnswerError
+        See :meth:`DenseSolver.ask` and :func:`vgtm_qp.qp.residual.refuse_large`.
     """
+    answer = solver.ask(qp)
     refuse_large(*residuals(answer, qp), answer.status)
+    return answer
 
 
 def check_question(solver: str, qp: DenseQP) -> None:

@@ -469,7 +469,7 @@ class FusedWorkspace:
             close=close,
             missing=missing,
         )
-        if self.solver is not DAQP:
+        if not self.solver.is_in_c:
             self._callback = ctypes.CFUNCTYPE(ctypes.c_int)(self._ask)
             self._program.set(other=ctypes.cast(self._callback, ctypes.c_void_p).value)
         if self.curve is not None:

@@ -9,9 +9,9 @@ import numpy as np
 import osqp
 from scipy import sparse
 
-from vgtm_qp.qp.dense import DenseAnswer, DenseQP, check, check_question, residuals
+from vgtm_qp.qp.dense import DenseAnswer, DenseQP, DenseSolver, check_question, residuals
 from vgtm_qp.qp.numbers import UNBOUNDED
-from vgtm_qp.qp.residual import TOLERANCE, AnswerError, InfeasibleStepError
+from vgtm_qp.qp.residual import TOLERANCE, AnswerError, InfeasibleStepError, refuse_large
 
 _SPARE = 8
 """Rows that a new workspace has beyond those of the first QP."""
@@ -47,8 +47,8 @@ _NEAR = 1e-4
 """Residual below which a further try starts from the answer so far; a worse start would delay it."""
 
 
-class Osqp:
-    """See :class:`vgtm_qp.qp.dense.DenseSolver`; answers are checked.
+class Osqp(DenseSolver):
+    """OSQP, with a workspace that is used again.
 
     All rows of the workspace are dense. Unused rows are zero and have infinite bounds, so that the sparsity
     does not change when near pairs come and go.
@@ -118,7 +118,7 @@ class Osqp:
                 break
         if answer is None:
             raise AnswerError("osqp: neither an answer nor a proof that there is none")
-        check(answer, qp)
+        refuse_large(*residuals(answer, qp), answer.status)
         workspace.start(answer)
         return answer
 

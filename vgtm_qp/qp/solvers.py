@@ -19,7 +19,7 @@ from vgtm_qp.parts import find_part, part_names
 from vgtm_qp.qp.answer import StepSolution
 from vgtm_qp.qp.condensed import CondensedSolver
 from vgtm_qp.qp.daqp import DAQP
-from vgtm_qp.qp.dense import DenseAnswer, DenseQP, DenseSolver, check, check_question
+from vgtm_qp.qp.dense import DenseAnswer, DenseQP, DenseSolver, check_question
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.long.select import chain_solver, prefers_staged
 from vgtm_qp.qp.numbers import StepNumbers, infinite
@@ -108,8 +108,8 @@ _TIGHT: Mapping[str, Mapping[str, float]] = {
 """Options with which the answers pass the residual check; with these solvers' defaults they would not."""
 
 
-class _QpSolvers:
-    """Any solver of qpsolvers, by name; see :class:`vgtm_qp.qp.dense.DenseSolver`. Answers are checked."""
+class _QpSolvers(DenseSolver):
+    """Any solver of qpsolvers, by name."""
 
     accuracy = 1e-8
 
@@ -150,9 +150,7 @@ class _QpSolvers:
             y[above] -= answer.z[count:]
         # The multipliers of the bounds follow from stationarity.
         of_bounds = -(hessian @ answer.x + gradient + y @ constraint)[:bounded]
-        found = DenseAnswer(np.array(answer.x), np.concatenate([of_bounds, y]), 0, self._name)
-        check(found, qp)
-        return found
+        return DenseAnswer(np.array(answer.x), np.concatenate([of_bounds, y]), 0, self._name)
 
     def _solved(self, problem: Any) -> Any:
         """Return the ``qpsolvers.Solution``.

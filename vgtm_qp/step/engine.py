@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from vgtm_qp.arm.arm import Kinematics
 from vgtm_qp.arm.symbols import Constants
 from vgtm_qp.arrays import Array
 from vgtm_qp.compiled import Kernel
-from vgtm_qp.errors import EvaluationError
+from vgtm_qp.errors import EvaluationError, SolverError
 from vgtm_qp.qp.answer import Accuracy, Closed, CurvePoint, Move, Settled, StepSolution
 from vgtm_qp.qp.condensed import CondensedSolver
 from vgtm_qp.qp.full import FullBuilder, StepQP
@@ -78,9 +78,12 @@ class Engine(ABC):
         """
         try:
             solution = self._least(asked)
-        except FailedStepError as error:
-            error.build = lambda: self.qp(asked)
+        except EvaluationError:
             raise
+        except SolverError as error:
+            failed = error if isinstance(error, FailedStepError) else FailedStepError(str(error))
+            failed.build = lambda: self.qp(asked)
+            raise failed from error.__cause__
         finally:
             spent("qp")
         arm, target = self.layout.arm, asked.target
@@ -134,6 +137,37 @@ class Engine(ABC):
         return None
 
 
+Missing = Callable[[Closed, CurvePoint], tuple[Array, float]]
+"""Returns the errors of the equalities that are settled, and their norm, m."""
+
+Correct = Callable[[Array, CurvePoint, Array], tuple[Array, CurvePoint] | None]
+"""Returns configuration and curve corrected by errors; None where nothing can correct these."""
+
+
+def settled(
+    q: Array,
+    curve: CurvePoint,
+    accuracy: Accuracy,
+    close: Callable[[Array], Closed],
+    missing: Missing,
+    correct: Correct,
+    most: int,
+) -> Settled | None:
+    """Return where a configuration and its curve are led by closing and by at most that many corrections, in turn."""
+    for count in range(most + 1):
+        closed = close(q)
+        errors, off = missing(closed, curve)
+        if not (closed.error <= accuracy.member and off <= accuracy.start):
+            return None
+        if count == most or off <= enough_tip_error(closed.q, accuracy.tip):
+            break
+        corrected = correct(closed.q, curve, errors)
+        if corrected is None:
+            break
+        q, curve = corrected
+    return Settled(closed, curve) if off <= accuracy.tip else None
+
+
 class Equalities:
     """Settles configurations and their curves by all equalities of a step."""
 
@@ -158,23 +192,27 @@ class Equalities:
         The Newton steps start with the Jacobian of the QP that was `asked`; their metric is that of its
         objective.
         """
-        arm, target = self._layout.arm, asked.target
-        gain, x, before = None, np.zeros(0), np.zeros(0)
-        for step in range(SETTLING_STEPS + 1):
-            closed = self._closing.close(q, target.lower, target.upper, accuracy.member)
-            missing = self._missing_at(closed.q, curve, asked, goal)
-            off = norm(self._layout.levers * missing)
-            if not (closed.error <= accuracy.member and off <= accuracy.start):
-                return None
-            if step == SETTLING_STEPS or off <= enough_tip_error(closed.q, accuracy.tip):
-                break
-            gain = first_gain() if gain is None else gain.updated(x, before - missing)
+        target, layout, arm = asked.target, self._layout, self._layout.arm
+        gain: Gain | None = None
+        x = before = np.zeros(0)
+
+        def close(q: Array) -> Closed:
+            return self._closing.close(q, target.lower, target.upper, accuracy.member)
+
+        def missing(closed: Closed, curve: CurvePoint) -> tuple[Array, float]:
+            errors = self._missing_at(closed.q, curve, asked, goal)
+            return errors, norm(layout.levers * errors)
+
+        def correct(q: Array, curve: CurvePoint, errors: Array) -> tuple[Array, CurvePoint] | None:
+            nonlocal gain, x, before
+            gain = first_gain() if gain is None else gain.updated(x, before - errors)
             if gain is None:
-                break
-            x, before = gain.per_missing @ missing, missing
+                return None
+            x, before = gain.per_missing @ errors, errors
             change = gain.solution(x)
-            q, curve = arm.advanced(closed.q, change.nodes, change.actuators), curve.after(change)
-        return Settled(closed, curve) if off <= accuracy.tip else None
+            return arm.advanced(q, change.nodes, change.actuators), curve.after(change)
+
+        return settled(q, curve, accuracy, close, missing, correct, SETTLING_STEPS)
 
     def _missing_at(self, q: Array, curve: CurvePoint, asked: QPInput, goal: TipGoal) -> Array:
         """Return the errors of the equalities, see ``missing_function``."""
@@ -272,21 +310,24 @@ class GeneralEngine(Engine):
         self, q: Array, curve: CurvePoint, target: Target, goal: TipGoal, accuracy: Accuracy
     ) -> Settled | None:
         """Return the configuration near `q` with the tip at `goal`: actuators correct the QP's answer."""
-        bounds, gain = (target.lower, target.upper), None
+        bounds, task, gain = (target.lower, target.upper), self._task, cache(self._gain)
         strokes = np.clip(self._strokes, *bounds)
-        for step in range(MOST_STEPS + 1):
-            closed = self._closing.close(q, *(np.clip(strokes, *bounds),) * 2, accuracy.member)
-            error = self._task.error(closed.tip_position, closed.tip_rotation, goal)
-            off = self._task.off(closed.tip_position, closed.tip_rotation, goal)
-            if not (closed.error <= accuracy.member and off <= accuracy.start):
+
+        def close(q: Array) -> Closed:
+            return self._closing.close(q, *(np.clip(strokes, *bounds),) * 2, accuracy.member)
+
+        def missing(closed: Closed, _: CurvePoint) -> tuple[Array, float]:
+            tip = closed.tip_position, closed.tip_rotation
+            return task.error(*tip, goal), task.off(*tip, goal)
+
+        def correct(q: Array, curve: CurvePoint, error: Array) -> tuple[Array, CurvePoint] | None:
+            nonlocal strokes
+            if (by_error := gain()) is None:
                 return None
-            if step == MOST_STEPS or off <= enough_tip_error(closed.q, accuracy.tip):
-                break
-            gain = self._gain() if gain is None else gain
-            if gain is None:
-                break
-            strokes, q = strokes + gain @ error, closed.q
-        return Settled(closed, curve) if off <= accuracy.tip else None
+            strokes = strokes + by_error @ error
+            return q, curve
+
+        return settled(q, curve, accuracy, close, missing, correct, MOST_STEPS)
 
     def _gain(self) -> Array | None:
         """Return the actuators' changes (n_a, n_e) per tip error after the last QP; None if they cannot settle it."""

@@ -60,7 +60,7 @@ class CompiledChain:
         self._functions = {name: Kernel(function) for name, function in self._given.items()}
         self._functions["values"] = Kernel(period_values(self._chain))
         self.library = building()
-        self._is_ready = None if isinstance(solver.dense, Daqp) and daqp_addresses() else False
+        self._is_ready = None if solver.dense.is_in_c and daqp_addresses() else False
         self._accuracy: Accuracy | None = None
 
     @property

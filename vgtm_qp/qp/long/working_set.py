@@ -11,11 +11,11 @@ from scipy.linalg.lapack import dpotrf, dpotrs, dpstrf
 
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.errors import SolverError
-from vgtm_qp.qp.dense import EQUALITY, DenseQP, DenseSolver
+from vgtm_qp.qp.dense import EQUALITY, DenseQP, DenseSolver, answered
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.long.chain_data import EndRows
 from vgtm_qp.qp.numbers import UNBOUNDED, RowNumbers
-from vgtm_qp.qp.residual import InfeasibleStepError
+from vgtm_qp.qp.residual import AnswerError, InfeasibleStepError
 
 BLOCK = 8
 """Least number of violated rows that enter the dual QP at once."""
@@ -222,9 +222,9 @@ def dual_solution(
         free = np.abs(value) >= UNBOUNDED
         bounds.append(np.where(free, value, (value - values[kept]) * scale))
     sense = np.where(equal[kept], EQUALITY, 0).astype(np.int32)
-    answer = solver.ask(DenseQP(np.eye(rank), np.zeros(rank), rows, bounds[0], bounds[1], sense))
+    answer = answered(solver, DenseQP(np.eye(rank), np.zeros(rank), rows, bounds[0], bounds[1], sense))
     if not answer.is_solved:
-        raise SolverError(answer.status)
+        raise AnswerError(answer.status)
     multipliers[kept] = answer.multipliers * scale
     return multipliers, answer.iterations
 
@@ -299,7 +299,7 @@ def solve_rows(
                 break
             refined += 1
             if refined > _REFINEMENTS:
-                raise SolverError(f"rounding left a row {violation.max():.1e} m or rad out of its bounds")
+                raise AnswerError(f"rounding left a row {violation.max():.1e} m or rad out of its bounds")
         else:
             added = find_columns(np.array(new, dtype=np.int64))
             columns = np.hstack([columns, added])
