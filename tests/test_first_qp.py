@@ -14,6 +14,8 @@ from vgtm_qp.maneuver.plan import make_plan
 from vgtm_qp.problem import bundled_problems
 from vgtm_qp.qp.residual import InfeasibleStepError
 from vgtm_qp.step.build import build_arm
+from vgtm_qp.step.chain_engine import ChainEngine
+from vgtm_qp.step.engine import GeneralEngine
 
 SOLVERS = {
     "clarabel": {"tol_gap_abs": 1e-14, "tol_gap_rel": 1e-14, "tol_feas": 1e-14},
@@ -145,3 +147,28 @@ def test_what_jams_now_or_within_the_step_is_in_the_qp_that_is_shown() -> None:
     shown = resolver.build()
     assert shown.column_lower[k] == pytest.approx(0.0, abs=1e-12)
     assert shown.column_upper[k] == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("bays", [5, 24])
+@pytest.mark.parametrize("error", [vq.SolverError, InfeasibleStepError])
+def test_a_step_that_a_qp_without_an_answer_blocks_carries_that_qp(bays, error, monkeypatch):
+    changes = {"truss.bays": bays, "method.tracking_mode": "elastic"}
+    resolver = vq.Resolver(vq.load_problem("five_bay_free").replace(changes))
+    goal = resolver.tip()[0] + np.array([0.01, 0.02, -0.01])
+    shown = resolver.build(position=goal)
+
+    def fails(*_):
+        raise error("the arm is in a singular pose")
+
+    for engine in (GeneralEngine, ChainEngine):
+        monkeypatch.setattr(engine, "solve", fails)
+    # The shortest piece of the path is tried last.
+    monkeypatch.setattr("vgtm_qp.step.qp_resolver._SMALLEST", 1.0)
+    step = resolver.step(position=goal)
+    assert not step.moved
+    assert isinstance(step.failure, error)
+    assert step.failed_qp is not None
+    assert abs(step.failed_qp.P - shown.P).max() < 1e-12
+    assert abs(step.failed_qp.A - shown.A).max() < 1e-12
+    for name in ("q", "row_lower", "row_upper", "column_lower", "column_upper"):
+        np.testing.assert_allclose(getattr(step.failed_qp, name), getattr(shown, name), atol=1e-12, rtol=0.0)
