@@ -195,6 +195,23 @@ def test_nodes_and_quantities_move_with_the_actuators(arm):
     check_motion(arm)
 
 
+@pytest.mark.parametrize("rows", [0, 1, 7])
+def test_rows_over_nodes_are_rows_over_actuators_by_the_response(arm, rows, rng):
+    motion = evaluated(arm, bent(arm, rng)).motion()
+    over_nodes = rng.normal(size=(rows, 3 * len(arm.free)))
+    wanted = over_nodes @ motion.response()[0]
+    np.testing.assert_allclose(motion.over_actuators(over_nodes), wanted, atol=1e-9)
+
+
+def test_rows_over_nodes_of_a_long_arm_are_rows_over_actuators(rng):
+    """Long enough for sparse matrices."""
+    arm = make_arm(vq.load_problem("five_bay_free").replace({"truss.bays": 40}))
+    motion = evaluated(arm, bent(arm, rng)).motion()
+    over_nodes = rng.normal(size=(3, 3 * len(arm.free)))
+    wanted = over_nodes @ motion.response()[0]
+    np.testing.assert_allclose(motion.over_actuators(over_nodes), wanted, atol=1e-9)
+
+
 def test_no_pose_is_out_of_reach(arm, rng):
     """The bound is met by the arm stretched out, and by no pose surpassed."""
     base, bound = np.flatnonzero(arm.base), arm.reach()

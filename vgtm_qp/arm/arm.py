@@ -209,6 +209,13 @@ class MotionRows(Protocol):
         """
         ...
 
+    def over_actuators(self, rows: Array) -> Array:
+        """Return rows (R, 3 (N - N_c)) over the free nodes' displacements as rows (R, n_a) over the actuators' changes.
+
+        The work is proportional to R, and to the length of the arm; SolverError as :meth:`response`.
+        """
+        ...
+
 
 class LengthRowsLike(Protocol):
     """Rows of lengths: gradients (M, Q, 3) by the nodes each depends on, and right-hand sides (M,)."""

@@ -84,6 +84,10 @@ class JacobianRows:
         """Return K and r."""
         return self.jacobian, self.rhs
 
+    def over_actuators(self, rows: Array) -> Array:
+        """Return the rows times K."""
+        return np.asarray(rows @ self.jacobian)
+
 
 class JointSpaceArm(Arm):
     """See ``arm.Arm``; everything that follows from the nodes as functions of the joints, base first.

@@ -13,7 +13,6 @@ from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.errors import CurveError
 from vgtm_qp.qp.layout import Layout
-from vgtm_qp.step.task import over_all_nodes
 
 ROWS = {"position": 3, "pointing": 5, "orientation": 6}
 """Number of coordinates that a station tracks on the curve."""
@@ -200,7 +199,9 @@ def _moves_well(rows: Array) -> bool:
 def moved_by_joints(arm: JointSpaceArm, kinematics: Kinematics) -> Array:
     """Return (N, 3, n_a) derivatives of the nodes where `kinematics` was evaluated, by the coordinates of segments."""
     response, _ = kinematics.motion().response()
-    return over_all_nodes(arm, response / arm.levers)
+    every = np.zeros((len(arm.node_names), 3, response.shape[1]))
+    every[arm.free] = (response / arm.levers).reshape(len(arm.free), 3, -1)
+    return every
 
 
 def tip_rows(arm: JointSpaceArm, kinematics: Kinematics, by_joints: Array, tracks: str) -> Array:

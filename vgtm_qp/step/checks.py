@@ -20,7 +20,7 @@ from vgtm_qp.qp.terms import Inequality, Objective
 from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.build import build_arm
 from vgtm_qp.step.setup import Setup
-from vgtm_qp.step.task import over_all_nodes, tip_response
+from vgtm_qp.step.task import tip_over_actuators
 
 _LOG = logging.getLogger(__name__)
 
@@ -73,7 +73,7 @@ def unreachable_tip(problem: Problem, setup: Setup) -> Iterator[Mistake]:
     goal = TipGoal(np.zeros(3), np.eye(3), np.zeros(3), np.zeros(3))
     kinematics.evaluate(arm.home_configuration)
     jacobian = task.rows(arm.home, kinematics, goal).jacobian
-    response = tip_response(arm, jacobian, over_all_nodes(arm, kinematics.motion().response()[0]))
+    response = tip_over_actuators(arm, kinematics.motion(), jacobian)
     response[len(task.axes) :] *= arm.height
     values = np.linalg.svd(response, compute_uv=False)
     reached = rank(values)

@@ -22,7 +22,7 @@ from vgtm_qp.step.actuation import Limits
 from vgtm_qp.step.separation import Separation
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import State
-from vgtm_qp.step.task import over_all_nodes, tip_response
+from vgtm_qp.step.task import over_actuators, tip_over_actuators
 
 _TRUST = 0.05
 """Trust region: greatest change of an actuator in the linear program, rad or a share of the arm's unit."""
@@ -92,7 +92,7 @@ class FirstOrder:
     ) -> None:
         arm, kinematics = setup.arm, setup.kinematics
         kinematics.evaluate(state.q)
-        every = over_all_nodes(arm, kinematics.motion().response()[0])
+        motion = kinematics.motion()
         tip = setup.task.rows(state.nodes, kinematics, goal)
         # Units of length, and of each actuator's changes, m or rad.
         self._size, self._sizes = arm.unit, arm.unit / arm.levers
@@ -102,10 +102,10 @@ class FirstOrder:
             # The tip must not be late: less than the whole piece does not count.
             self._trust, self.unit = reach * max(_TRUST, _FURTHER * length), reach
         self.progress = min(self.unit / reach, 1.0)
-        response = tip_response(arm, tip.jacobian, every) * self._sizes
+        response = tip_over_actuators(arm, motion, tip.jacobian) * self._sizes
         self._equal = np.column_stack([response, -tip.rate * self.unit]) / self._size
         self._rows = separation.rows(state.q, state.time, 0.0, 2.0 * self._trust * self._size, {}, 0.0)
-        near = np.einsum("rsc,rscn->rn", self._rows.coefficients, every[self._rows.nodes])
+        near = over_actuators(arm, motion, self._rows.nodes, self._rows.coefficients)
         self._near = np.column_stack([-near * self._sizes, np.zeros(len(near))]) / self._size
         self._near_bound = np.maximum(setup.margin - self._rows.lower, 0.0) / self._size
         now = state.quantities[arm.actuators]

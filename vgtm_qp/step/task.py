@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vgtm_qp.arm.arm import Arm, Kinematics
-from vgtm_qp.arrays import Array
+from vgtm_qp.arm.arm import Arm, Kinematics, MotionRows
+from vgtm_qp.arrays import Array, Index
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.errors import GoalError
 from vgtm_qp.qp.numbers import norm
@@ -132,16 +132,20 @@ class TipTask:
         return Path.straight(here, rotation, there, turned, spin)
 
 
-def over_all_nodes(arm: Arm, response: Array) -> Array:
-    """Return displacements (3 (N - N_c), n) of the free nodes as those of all nodes, (N, 3, n)."""
-    every = np.zeros((len(arm.node_names), 3, response.shape[1]))
-    every[arm.free] = response.reshape(len(arm.free), 3, response.shape[1])
-    return every
+def over_actuators(arm: Arm, motion: MotionRows, nodes: Index, coefficients: Array) -> Array:
+    """Return rows over displacements of `nodes` (R, S), by `coefficients` (R, S, 3), as rows (R, n_a) over actuators.
+
+    Nodes of the base do not move. SolverError in a singular pose.
+    """
+    rows = np.zeros((len(nodes), len(arm.node_names), 3))
+    np.add.at(rows, (np.arange(len(nodes))[:, None], nodes), coefficients)
+    return motion.over_actuators(rows[:, arm.free].reshape(len(nodes), 3 * len(arm.free)))
 
 
-def tip_response(arm: Arm, jacobian: Array, every: Array) -> Array:
-    """Return (n_e, n) changes of the tip's coordinates, by `jacobian` (n_e, 3 K_tip), for displacements (N, 3, n)."""
-    return np.asarray(jacobian @ every[arm.end_effector.nodes].reshape(jacobian.shape[1], every.shape[2]))
+def tip_over_actuators(arm: Arm, motion: MotionRows, jacobian: Array) -> Array:
+    """Return (n_e, n_a) the changes of the tip's coordinates, by `jacobian` (n_e, 3 K_tip), with the actuators."""
+    nodes = np.broadcast_to(arm.end_effector.nodes, (len(jacobian), len(arm.end_effector.nodes)))
+    return over_actuators(arm, motion, nodes, jacobian.reshape(*nodes.shape, 3))
 
 
 def duration(dt: float) -> float:

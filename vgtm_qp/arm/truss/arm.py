@@ -142,7 +142,7 @@ class TrussArm(Arm):
         at_nodes, tip = np.zeros_like(self.home), self.end_effector
         at_nodes[tip.nodes] = tip.weights[:, None] * load
         jacobian = self.truss.scatter.sparse(length_gradients(self.truss, q))
-        return solved(jacobian.T.tocsc(), at_nodes[self.free].reshape(-1))
+        return solved(jacobian.T, at_nodes[self.free].reshape(-1))
 
     def travel(self, motion: Array) -> float:
         return float(np.abs(motion).max())

@@ -95,9 +95,17 @@ class LengthRows:
         known = np.zeros((members, count + 1))
         known[truss.actuators, np.arange(count)] = 1.0
         known[:, -1] = self.rhs
-        small = members <= _DENSE
-        answer = solved(self.jacobian() if small else truss.scatter.sparse(self.gradient), known)
+        answer = solved(self._matrix(), known)
         return answer[:, :-1], answer[:, -1]
+
+    def over_actuators(self, rows: Array) -> Array:
+        """Return the rows times K by J' y = row'; see ``arm.MotionRows``."""
+        return np.ascontiguousarray(solved(self._matrix().T, rows.T)[self.truss.actuators].T)
+
+    def _matrix(self) -> Any:
+        """Return the length Jacobian, dense if it is small."""
+        truss = self.truss
+        return self.jacobian() if truss.member_count <= _DENSE else truss.scatter.sparse(self.gradient)
 
 
 def solved(jacobian: Any, known: Array) -> Array:
@@ -106,7 +114,7 @@ def solved(jacobian: Any, known: Array) -> Array:
         if isinstance(jacobian, np.ndarray):
             answer = np.asarray(np.linalg.solve(jacobian, known), dtype=float)
         else:
-            answer = np.asarray(splu(jacobian).solve(known), dtype=float)
+            answer = np.asarray(splu(jacobian.tocsc()).solve(known), dtype=float)
     except (np.linalg.LinAlgError, RuntimeError) as reason:
         raise SolverError(_SINGULAR) from reason
     if not np.isfinite(answer).all():
