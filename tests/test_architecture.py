@@ -12,8 +12,11 @@ import pytest
 
 import vgtm_qp
 from vgtm_qp.geometry.exact import CONTACT
+from vgtm_qp.geometry.watch import AXIS
+from vgtm_qp.qp.dense import EQUALITY
 from vgtm_qp.qp.fused import SUMS
-from vgtm_qp.qp.long.working_set import BLOCK
+from vgtm_qp.qp.long.working_set import BLOCK, REFINEMENTS, UNMOVABLE
+from vgtm_qp.qp.numbers import UNBOUNDED
 from vgtm_qp.step.separation import MOST_PIECES
 
 PACKAGE = Path(vgtm_qp.__file__).parent
@@ -163,10 +166,12 @@ def test_tests_import_no_other_test() -> None:
 
 
 def test_what_c_and_python_both_know_is_the_same() -> None:
-    """Numbers that size the arrays which Python makes and C fills."""
+    """Numbers that size the arrays which Python makes and C fills, and those by which both decide."""
     text = "".join(file.read_text(encoding="utf-8") for file in sorted((PACKAGE / "native").glob("*.[ch]")))
-    of_c = {name: int(value) for name, value in re.findall(r"\b([A-Z_]+) = (\d+)\b", text)}
-    known = {"MOST_PIECES": MOST_PIECES, "BLOCK": BLOCK, "CONTACT": CONTACT, "SUMS": SUMS}
+    of_c = {name: float(value) for name, value in re.findall(r"\b([A-Z_]+) = ([\d.e+-]+)", text)}
+    sizes = {"MOST_PIECES": MOST_PIECES, "BLOCK": BLOCK, "CONTACT": CONTACT, "SUMS": SUMS, "AXIS": AXIS}
+    marks = {"EQUALITY": EQUALITY, "UNBOUNDED": UNBOUNDED, "UNMOVABLE": UNMOVABLE, "REFINEMENTS": REFINEMENTS}
+    known = sizes | marks
     assert {name: of_c[name] for name in known} == known
 
 

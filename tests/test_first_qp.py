@@ -152,7 +152,8 @@ def test_what_jams_now_or_within_the_step_is_in_the_qp_that_is_shown() -> None:
 @pytest.mark.parametrize("bays", [5, 24])
 @pytest.mark.parametrize("error", [vq.SolverError, InfeasibleStepError])
 def test_a_step_that_a_qp_without_an_answer_blocks_carries_that_qp(bays, error, monkeypatch):
-    changes = {"truss.bays": bays, "method.tracking_mode": "elastic"}
+    # A tip that must be on time tries no shorter pieces of its path.
+    changes = {"truss.bays": bays, "method.tracking_mode": "elastic", "end_effector.mode": "hard"}
     resolver = vq.Resolver(vq.load_problem("five_bay_free").replace(changes))
     goal = resolver.tip()[0] + np.array([0.01, 0.02, -0.01])
     shown = resolver.build(position=goal)
@@ -162,8 +163,6 @@ def test_a_step_that_a_qp_without_an_answer_blocks_carries_that_qp(bays, error, 
 
     for engine in (GeneralEngine, ChainEngine):
         monkeypatch.setattr(engine, "solve", fails)
-    # The shortest piece of the path is tried last.
-    monkeypatch.setattr("vgtm_qp.step.qp_resolver._SMALLEST", 1.0)
     step = resolver.step(position=goal)
     assert not step.moved
     assert isinstance(step.failure, error)

@@ -33,7 +33,7 @@ AHEAD = 1.2
 _FEW_PAIRS = 4_000
 """Greatest number of bodies, times that of bodies and pieces, of a scene whose pairs are all listed."""
 
-_AXIS, _RIGID = 7, 11
+AXIS, _RIGID = 7, 11
 """Numbers in C of the axis of a body, and of the motion of a part of the arm."""
 
 _LISTED = np.dtype([("body", np.int32), ("other", np.int32), ("lower", np.float64)])
@@ -301,7 +301,7 @@ class Watch:
             line=np.zeros((2, *X.shape)),
             bodies=count,
             radius=bodies.radius,
-            axis=np.zeros((count, _AXIS)),
+            axis=np.zeros((count, AXIS)),
             middle=np.zeros((count, 3)),
             turned=np.zeros(count),
             moved=np.zeros(count),

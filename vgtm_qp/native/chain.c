@@ -95,8 +95,11 @@ typedef struct {
     double *work;
 } Chain;
 
-/* Rows that pass through the elimination at once. */
-enum { BLOCK = 8 };
+/* Rows that pass through the elimination at once; times that rounding may be removed; DAQP's mark of an equality. */
+enum { BLOCK = 8, REFINEMENTS = 4, EQUALITY = 5 };
+
+/* What counts as an infinite bound; by how much a row that nothing moves may be out of its bounds. */
+static const double UNBOUNDED = 1e30, UNMOVABLE = 1e-9;
 
 /* Periods whose rows are summed up at once. */
 enum { CHUNK = 16 };
@@ -459,7 +462,7 @@ static void bound(Chain *c)
     const double *tail = c->tail + (Index)(c->end_station / (c->stations ? c->stations : 1)) * c->tails;
     int s = c->stations ? c->end_station % c->stations : 0;
     c->total = near_at(c) + c->near;
-    for (int k = 0; k < c->total; k++) high[k] = 1e30;
+    for (int k = 0; k < c->total; k++) high[k] = UNBOUNDED;
     for (int k = 0; k < c->tips; k++) low[k] = high[k] = error[k];
     for (int k = c->tips; k < end_at(c); k++) low[k] = high[k] = 0.0;
     for (int k = 0; k < c->ends; k++) {
@@ -730,7 +733,7 @@ static int solve_dual(Chain *c, const double *value)
         if (!(size < INFINITY)) return FAILED;
         if (size < c->no_row) {
             int r = c->row[i];
-            if (fmax(c->low[r] - value[i], value[i] - c->high[r]) > 1e-9) return INFEASIBLE;
+            if (fmax(c->low[r] - value[i], value[i] - c->high[r]) > UNMOVABLE) return INFEASIBLE;
             continue;
         }
         scale[K] = 1.0 / size;
@@ -741,9 +744,9 @@ static int solve_dual(Chain *c, const double *value)
     for (int i = 0; i < K; i++) {
         int at = c->kept[i], r = c->row[at];
         for (int j = 0; j < K; j++) scaled[i * K + j] = c->gram[(Index)at * c->room + c->kept[j]] * scale[i] * scale[j];
-        low[i] = fabs(c->low[r]) >= 1e30 ? c->low[r] : (c->low[r] - value[at]) * scale[i];
-        high[i] = fabs(c->high[r]) >= 1e30 ? c->high[r] : (c->high[r] - value[at]) * scale[i];
-        sense[i] = r < equal(c) ? 5 : 0;
+        low[i] = fabs(c->low[r]) >= UNBOUNDED ? c->low[r] : (c->low[r] - value[at]) * scale[i];
+        high[i] = fabs(c->high[r]) >= UNBOUNDED ? c->high[r] : (c->high[r] - value[at]) * scale[i];
+        sense[i] = r < equal(c) ? EQUALITY : 0;
     }
     int rank = pivoted_factor(scaled, rows, K, c->dependent * K);
     memset(identity, 0, sizeof(double) * rank * rank);
@@ -854,7 +857,7 @@ static int solve_rows(Chain *c)
         if (!violated) break;
         if (room > c->room) return CROWDED;
         count = worst_rows(c, room, rows);
-        if (!count && ++refined > 4) return FAILED;
+        if (!count && ++refined > REFINEMENTS) return FAILED;
     }
     memset(c->every, 0, sizeof(double) * c->total);
     for (int i = 0; i < c->active; i++) c->every[c->row[i]] = c->multiplier[i];

@@ -24,7 +24,11 @@ NO_ROW = 1e-11
 DEPENDENT = 1e-14
 INDEPENDENT = 1e-4
 """Ratio of the least to the greatest Cholesky pivot above which rows are far from dependent."""
-_REFINEMENTS = 4
+REFINEMENTS = 4
+"""Times that rounding may be removed from an answer whose rows are all known."""
+
+UNMOVABLE = 1e-9
+"""Distance from its bounds, m or rad, that is allowed to a row that nothing moves."""
 
 
 MemberRows = Callable[[Index], tuple[Index, Array]]
@@ -206,7 +210,7 @@ def dual_solution(
     empty = norm < NO_ROW
     if empty.any():
         outside = np.maximum(lower - values, values - upper)[empty]
-        if outside.max() > 1e-9:
+        if outside.max() > UNMOVABLE:
             raise InfeasibleStepError("a hard row cannot be moved by any actuator")
     kept = np.flatnonzero(~empty)
     if not len(kept):
@@ -298,7 +302,7 @@ def solve_rows(
             if not len(violated):
                 break
             refined += 1
-            if refined > _REFINEMENTS:
+            if refined > REFINEMENTS:
                 raise AnswerError(f"rounding left a row {violation.max():.1e} m or rad out of its bounds")
         else:
             added = find_columns(np.array(new, dtype=np.int64))
