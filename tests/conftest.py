@@ -1,4 +1,7 @@
-"""Settings of all tests: how many processes run them, which ones, and what they draw at random."""
+"""Settings of all tests: how many processes run them, which ones, and what they draw at random.
+
+A run of all files takes one in four of the tests marked dear, each run others; ``--all`` takes every one.
+"""
 
 import os
 import secrets
@@ -21,8 +24,13 @@ settings.register_profile("property", derandomize=False, print_blob=True)
 settings.load_profile("property")
 
 
+FEW = 4
+"""Of the dear tests a run of all files takes one in that many."""
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Add the option that repeats the random cases of a run."""
+    """Add the options that choose tests and their random cases."""
+    parser.addoption("--all", action="store_true", help=f"Take all dear tests, not one in {FEW} by the seed")
     parser.addoption(
         "--seed", type=int, metavar="N", help="Draw the random cases of seed N, which an earlier run has told"
     )
@@ -64,13 +72,17 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: p
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
     """Use all cores; for files and tests that are named, and for what is printed by ``-s``, this process alone."""
-    named = config.args_source is pytest.Config.ArgsSource.ARGS and all(".py" in each for each in config.args)
-    if named or config.option.capture == "no":
+    if are_files_named(config) or config.option.capture == "no":
         return 0
     cores = os.environ.get("PYTEST_XDIST_AUTO_NUM_WORKERS", "")
     if cores.isdigit():
         return int(cores)
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def are_files_named(config: pytest.Config) -> bool:
+    """Return whether files or tests are named, rather than folders or nothing."""
+    return config.args_source is pytest.Config.ArgsSource.ARGS and all(".py" in each for each in config.args)
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -79,19 +91,19 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     for item in items:
         if isinstance(item, pytest.Function) and (is_hypothesis_test(item.obj) or "rng" in item.fixturenames):
             item.add_marker("property")
-    if config.option.one_in > 1:
-        left_out = [item for item in items if item.get_closest_marker("property") and not is_chosen(item)]
-        config.hook.pytest_deselected(items=left_out)
-        items[:] = [item for item in items if item not in set(left_out)]
+    option = config.option
+    is_plain = not (option.all or option.markexpr or option.keyword or are_files_named(config))
+    shares = {"property": option.one_in, "dear": FEW if is_plain else 1}
+    left_out = [item for item in items if not all(is_chosen(item, *share) for share in shares.items())]
+    config.hook.pytest_deselected(items=left_out)
+    items[:] = [item for item in items if item not in set(left_out)]
 
 
-def is_chosen(item: pytest.Item) -> bool:
-    """Return whether a test that draws random cases is one of those of the seed, or always chosen."""
-    option = item.config.option
-    return (
-        item.get_closest_marker("anew") is not None
-        or (zlib.crc32(item.nodeid.encode()) + option.seed) % option.one_in == 0
-    )
+def is_chosen(item: pytest.Item, marker: str, one_in: int) -> bool:
+    """Return whether a test is taken, if of those with a `marker` the seed chooses `one_in` that many."""
+    if not item.get_closest_marker(marker) or (marker == "property" and item.get_closest_marker("anew")):
+        return True
+    return (zlib.crc32(item.nodeid.encode()) + item.config.option.seed) % one_in == 0
 
 
 @pytest.fixture

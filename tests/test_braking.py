@@ -166,6 +166,7 @@ SIDEWAYS = {"time": 10.0, "position": [0.12, 0.02, 0.0]}
 IN_THE_WAY = {**CRATE, "center": [0.92, 0.3, 1.8]}
 
 
+@pytest.mark.dear
 @pytest.mark.parametrize("mode", ["scaled", "elastic"])
 @pytest.mark.parametrize(("base", "obstacles"), [(SLOW, [CRATE]), (SIDEWAYS, [IN_THE_WAY])])
 @pytest.mark.parametrize("known", [1, None])

@@ -89,6 +89,7 @@ def make_asked(layout, k, rng):
     return QPInput(X, at, points, np.zeros(0), target, target.goal(progress), progress, rows, motion)
 
 
+@pytest.mark.dear
 @pytest.mark.parametrize(
     ("name", "vertices", "hard"),
     [(name, vertices, False) for name in MODULES for vertices in (5, 0)]

@@ -122,6 +122,7 @@ def compare(problem: vq.Problem, rng: np.random.Generator, count: int, tolerance
         assert (one.state is before) == (not found.moved)
 
 
+@pytest.mark.dear
 @pytest.mark.parametrize("name", NAMES)
 def test_it_takes_the_steps_of_an_attempt(name, driven, rng):
     problem = CASES[name].load()
@@ -203,6 +204,7 @@ def test_it_takes_the_steps_of_bundled_problems(change, name, driven, rng):
     assert any(driven)
 
 
+@pytest.mark.dear
 @pytest.mark.parametrize("number", range(12))
 @pytest.mark.parametrize(
     ("change", "of_serial_arms"),
@@ -244,6 +246,7 @@ CURVES = [
 ]
 
 
+@pytest.mark.dear
 @pytest.mark.parametrize("solver", ["daqp", "piqp"])
 @pytest.mark.parametrize(("module", "bays", "curve", "method"), CURVES, ids=str)
 def test_it_takes_the_steps_on_curves_that_tables_do_not_describe(
@@ -309,6 +312,7 @@ LONG = [
 ]
 
 
+@pytest.mark.dear
 @pytest.mark.parametrize("distance", ["fcl", "exact"])
 @pytest.mark.parametrize(("module", "mode", "asked"), LONG, ids=str)
 def test_it_takes_the_steps_of_long_arms_among_obstacles(module, mode, asked, distance, driven, rng):
@@ -383,6 +387,7 @@ def far_goals(resolver: vq.Resolver, rng: np.random.Generator, count: int) -> It
         yield goal
 
 
+@pytest.mark.dear
 @pytest.mark.parametrize("name", FURTHER)
 def test_further_qps_are_those_of_an_attempt(name, driven, monkeypatch, rng):
     problem = problem_of_two_qps(FURTHER[name][0], **FURTHER[name][1])

@@ -491,12 +491,14 @@ def test_every_key_has_a_case():
     assert method == SERVED.keys()
 
 
+@pytest.mark.dear
 @pytest.mark.parametrize("key", [*CASES, *GRAPH_CASES, *ARM_CASES])
 def test_a_key_changes_something(key):
     ways = SERVED[key.removeprefix("method.")] if key.startswith("method.") else tuple(WAYS)
     assert_something_changes(*base(key, ways[0]), key)
 
 
+@pytest.mark.dear
 @pytest.mark.parametrize("way", list(WAYS)[1:])
 @pytest.mark.parametrize("key", SERVED)
 def test_a_key_of_the_method_does_something_in_every_way_or_is_refused(key, way):
@@ -513,6 +515,7 @@ def test_a_key_of_the_method_does_something_in_every_way_or_is_refused(key, way)
         problem.replace(changes)
 
 
+@pytest.mark.dear
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("key", [key for key in CASES if key.startswith(("truss.", "obstacle."))])
 def test_arm_and_obstacles_matter_in_every_way(key, way):

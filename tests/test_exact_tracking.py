@@ -118,6 +118,7 @@ def test_stations_stay_on_the_curve_where_leaving_it_gets_the_arm_no_further():
     assert exact.certificate.states_off_curve.value < 0.03
 
 
+@pytest.mark.dear
 @pytest.mark.parametrize("mode", ["exact", "elastic"])
 def test_the_curve_never_ends_against_the_direction_of_the_tip(mode):
     """Its last leg used to shrink from step to step where the arm crept into a dead end, and then reversed."""
@@ -425,6 +426,7 @@ def test_an_arm_without_faces_is_not_moved_along_them(tracking):
         Resolver(problem.replace({"method": {"name": "qp", "tracking": tracking}}))
 
 
+@pytest.mark.dear
 def test_where_exact_tracking_is_stuck_its_ways_out_are_those_of_elastic_tracking():
     problem = random_scene(1991, 241, steps=30).problem
     exact, elastic = (

@@ -34,6 +34,7 @@ def with_followers(problem):
     return [{**joint, "mimic": rules[k]} if k in rules else joint for k, joint in enumerate(joints)]
 
 
+@pytest.mark.dear
 @pytest.mark.skipif(compiler() is None, reason="no C compiler")
 @pytest.mark.parametrize(("name", "changes"), SCENES)
 def test_both_paths_take_the_same_steps_from_every_state_of_a_maneuver(name, changes):

@@ -364,6 +364,7 @@ def test_between_cylinders_the_states_are_those_of_closed_forms_to_what_fcl_leav
     np.testing.assert_allclose(found[0].nodes, found[1].nodes, atol=1e-4)
 
 
+@pytest.mark.dear
 @pytest.mark.parametrize("untruth", [lie for lie in LIES if lie not in (other_pair, not_the_nearest)])
 @pytest.mark.parametrize("velocity", [[0.0, 0.0, 0.0], [-0.01, 0.0, 0.005]], ids=["rests", "moves"])
 def test_every_row_that_presses_is_proven_and_lies_change_no_step(untruth, velocity, problem, monkeypatch):

@@ -87,6 +87,7 @@ def first_answer(resolver, asked):
     return found[0]
 
 
+@pytest.mark.dear
 @pytest.mark.parametrize(("name", "limit"), [*((name, None) for name in QPS), ("five_bay_two_cubes", 0.03)])
 def test_other_solvers_give_the_first_answer_of_the_step(name, limit):
     problem = vq.load_problem(name)

@@ -118,6 +118,7 @@ def test_no_near_pair_of_what_bends_is_missed(seed, rods, tracked):
         assert monitor.keeps(state, 0.0, floors[False], floors[True]) == keeps
 
 
+@pytest.mark.dear
 @pytest.mark.skipif(compiler() is None, reason="no C compiler")
 @settings(max_examples=10, deadline=None)
 @given(st.integers(0, 2**31), st.booleans())

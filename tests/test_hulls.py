@@ -160,6 +160,7 @@ def test_rows_agree_with_finite_differences(seed):
             assert change == pytest.approx(row, abs=2e-3)
 
 
+@pytest.mark.dear
 @pytest.mark.property
 @settings(deadline=None, max_examples=15)
 @given(seeds, st.booleans())

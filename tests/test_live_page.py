@@ -315,6 +315,7 @@ def live() -> Iterator[Live]:
         assert not loop.is_alive()
 
 
+@pytest.mark.dear
 def test_every_control_is_driven_without_an_error(live: Live):
     drive_obstacles(live)
     drive_carrying(live)

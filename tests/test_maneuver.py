@@ -234,6 +234,7 @@ def is_free_at_home(problem):
     )
 
 
+@pytest.mark.dear
 @settings(max_examples=40, deadline=None, suppress_health_check=list(HealthCheck))
 @given(problem=scenes())
 def test_whatever_comes_out_of_a_random_scene_is_verified(problem):

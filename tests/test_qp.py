@@ -213,6 +213,7 @@ def random_step(layout, rng, *, motion=True, base=False):
     )
 
 
+@pytest.mark.dear
 @pytest.mark.parametrize("joint_offset", [0.0, 0.1])
 @pytest.mark.parametrize(("name", "curve", "track"), LINEAR, ids=str)
 def test_a_linearisation_has_the_numbers_of_the_equations(name, curve, track, joint_offset, rng):

@@ -45,6 +45,7 @@ def random_problem(random):
     return three_bays(obstacle=boxes, **changes)
 
 
+@pytest.mark.dear
 def test_what_is_named_lets_the_arm_go_on_and_nothing_else_does(rng):
     """Of random stops at most one in ten has no remedy, and no arm goes on as it is."""
     stops, helped = 0, 0

@@ -101,6 +101,7 @@ DRONE = {
 }
 
 
+@pytest.mark.dear
 @pytest.mark.parametrize(
     ("name", "changes"),
     [

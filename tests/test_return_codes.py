@@ -58,6 +58,7 @@ def test_a_function_without_a_value_at_its_first_call_raises():
         inverse()()
 
 
+@pytest.mark.dear
 @needs_compiler
 @pytest.mark.parametrize("compiled", [False, True])
 def test_a_tip_that_cannot_be_moved_is_not_settled(compiled, tmp_path, monkeypatch):
@@ -215,6 +216,7 @@ def solved(scenes, **environment):
     return [json.loads(line) for line in done.stdout.splitlines() if line.startswith("[")]
 
 
+@pytest.mark.dear
 @needs_compiler
 def test_random_scenes_end_alike_with_and_without_a_compiler(rng):
     scenes = [*BEFORE, *([seed, 0] for seed in rng.integers(2**31, size=3).tolist())]

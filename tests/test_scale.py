@@ -49,6 +49,7 @@ def scaled(value: Any, factor: float, key: str = "") -> Any:
     return value * factor if key in LENGTHS and isinstance(value, float | int) else value
 
 
+@pytest.mark.dear
 @pytest.mark.parametrize("factor", [1e3, 1e-3])
 @pytest.mark.parametrize("name", [*PROBLEMS, "least angle"])
 def test_a_larger_or_smaller_arm_moves_in_the_same_way(name, factor):

@@ -113,6 +113,7 @@ def test_serial_scenes_have_everything_that_a_problem_may_say_about_serial_arms(
         assert home >= scene.clearance.safe
 
 
+@pytest.mark.dear
 @pytest.mark.anew
 @pytest.mark.parametrize("arms", ["trusses", "serial"])
 def test_no_scene_of_a_new_seed_is_unsafe_or_ends_without_a_word(rng, arms):
@@ -128,6 +129,7 @@ def test_no_scene_of_a_new_seed_is_unsafe_or_ends_without_a_word(rng, arms):
     assert all((row["status"] == "solved") != bool(row["stop"]) for row in tried)
 
 
+@pytest.mark.dear
 @pytest.mark.parametrize("number", [1, 10, 43])
 def test_sampled_motions_agree_with_the_certificate_and_show_a_clearance_that_is_not_kept(number):
     maneuver = solve(varied_scene(1991, number, arms="serial"))
@@ -153,6 +155,7 @@ def test_sampled_motions_agree_with_the_certificate_and_show_a_clearance_that_is
     assert not is_safe(maneuver, more)
 
 
+@pytest.mark.dear
 @pytest.mark.parametrize("arms", ["trusses", "serial"])
 def test_ipopt_solves_scenes_step_by_step_with_exact_states(arms):
     given = tasks(False, scenes=2, seed=7, steps=12, arms=arms, without_compiler=9, against="ipopt")
@@ -164,6 +167,7 @@ def test_ipopt_solves_scenes_step_by_step_with_exact_states(arms):
     assert "by IPOPT without any curve" in text(rows)
 
 
+@pytest.mark.dear
 @pytest.mark.parametrize("number", [4, 7, 15, 21, 28])
 def test_a_scene_for_ipopt_keeps_tip_and_limits_of_every_kind(number):
     """Hard and elastic tips, limited accelerations, jams; what is not exact at states would be a failure."""

@@ -22,6 +22,7 @@ def boxes(random):
     return found
 
 
+@pytest.mark.dear
 def test_without_the_named_obstacles_or_limits_a_blocked_arm_gets_further(rng):
     """In one of some 200 such scenes it then takes another way, into another dead end before the first one."""
     further = []
@@ -185,6 +186,7 @@ def test_the_ways_out_are_those_that_a_problem_has():
     assert not any("bulged" in name for name, _ in retries(drawn, dead_end(vertices=4)))
 
 
+@pytest.mark.dear
 @pytest.mark.slow
 @pytest.mark.parametrize(("seed", "number", "way"), [(0, 9, "actuators drawn"), (0, 57, "curve bulged")])
 def test_a_dead_end_of_one_shape_is_passed_in_another(seed, number, way):

@@ -119,6 +119,7 @@ def test_a_snake_can_start_in_every_direction(universal: int) -> None:
 SHORT = ("figure4", "figure7", "figure8", "joints", "clutter")
 
 
+@pytest.mark.dear
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=[] if name in SHORT else [pytest.mark.slow]) for name in STUDIES]
 )

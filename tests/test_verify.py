@@ -322,6 +322,7 @@ def encounters(truss: Any, nodes: Any, obstacles: list[dict[str, Any]]) -> tuple
     return motion, [*(AgainstBody(motion, body) for body in bodies), AgainstMembers(motion)]
 
 
+@pytest.mark.dear
 @pytest.mark.parametrize("joints", [False, True])
 @pytest.mark.parametrize("_", range(3))
 def test_bound_between_states_is_below_every_instant_and_close(

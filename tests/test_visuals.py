@@ -154,6 +154,7 @@ def test_links_move_with_the_joints_and_can_be_hidden(problem):
     assert not any(frame.visible for frame in handles.frames.values())
 
 
+@pytest.mark.dear
 @pytest.mark.skipif(not CHROMIUM.exists(), reason=f"no browser: {CHROMIUM} is not there")
 def test_on_the_page_links_give_way_to_bodies(problem):
     pytest.importorskip("viser")

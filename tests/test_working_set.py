@@ -33,6 +33,7 @@ class Listening(DenseSolver):
         return self.answer
 
 
+@pytest.mark.dear
 @pytest.mark.property
 @pytest.mark.parametrize("curve", ["none", "tables", "hard", "hard turns"])
 @pytest.mark.parametrize("name", ["octahedral", "hexapod", "longeron"])
