@@ -100,6 +100,33 @@ def test_both_engines_give_one_answer(name, joint_offset, base, rng):
     assert done or name == "tetrahedral-2"
 
 
+@pytest.mark.parametrize("hard", [False, True])
+@pytest.mark.parametrize("name", ELIMINABLE)
+def test_both_engines_leave_an_elastic_tip_behind_by_as_much(name, hard, rng):
+    """Boxes of all sizes: where they are narrow, the tip cannot reach its goal."""
+    layout, task = make_layout(TRUSSES[name](), TRACKS.get(name, ("position",)), vertices=5)
+    layout = replace(layout, elastic_tip=True)
+    if hard:
+        layout = replace(layout, hard_tracking=True)
+    kinematics = layout.arm.kinematics()
+    both = general(layout, kinematics, task), fused_engine(layout, kinematics, task)
+    behind = 0
+    for size in (1e-4, 1e-3, 1e-2, 1e-1):
+        X, Y, vertices, target, rows = make_step(layout, kinematics, rng, base=False)
+        kinematics.evaluate(X)
+        now = kinematics.quantities[layout.arm.actuators]
+        target = replace(target, lower=now - size, upper=now + size)
+        asked = QPInput(X, Y, vertices, np.zeros(0), target, target.path.at(0.0), 0.0, rows, True)
+        found = answers(both, asked)
+        if found is None:
+            continue
+        assert_same_answer(*found, tolerance=1e-7)
+        assert found[0].tip_slack == pytest.approx(found[1].tip_slack, abs=1e-7)
+        assert found[0].progress == pytest.approx(1.0, abs=1e-12)
+        behind += found[0].tip_slack > 1e-4
+    assert behind
+
+
 @pytest.mark.parametrize(
     ("name", "shape", "family"),
     [(name, "everything", "bezier") for name in ELIMINABLE]

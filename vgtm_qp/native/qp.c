@@ -7,16 +7,18 @@
 #include <daqp/api.h>
 
 typedef struct {
-    /* Numbers of: unknowns n; actuators n_a; columns of the free nodes; least-squares rows L; rows of the tip, of
-       stations, of legs, of clearance; control vertices, torsion coordinates; coordinates of q. */
-    int unknowns, actuators, nodes, squares, tips, hard, legs, near, vertices, torsion, coordinates;
+    /* Numbers of: unknowns n, which are actuators n_a, free coordinates of the curve, slacks of an elastic tip and the
+       progress; columns of the free nodes; least-squares rows L; rows of the tip, of stations, of legs, of clearance;
+       control vertices, torsion coordinates; coordinates of q. */
+    int unknowns, actuators, slacks, nodes, squares, tips, hard, legs, near, vertices, torsion, coordinates;
+    const double *slack_pull, *slack_weight;   /* gradient and curvature of the slacks' penalty */
     /* Whether q moves with the nodes; a row of clearance names this many nodes. */
     int by_nodes, slots;
     /* Root of the node rate's weight, inverted; weights (n_a) of the actuators' changes. */
     double scale;
     const double *actuator_weight;
-    /* Distance from a bound, and remaining path, that count as zero; worst condition of a gain. */
-    double at_bound, left, worst_condition;
+    /* Distance from a bound, remaining path, and slack of the tip, that count as zero; worst condition of a gain. */
+    double at_bound, left, on_path, worst_condition;
     int settling_steps, closing_steps;
     /* Errors of quantities: beyond the first, Newton's method is not tried; below the second, one step of it leaves so
        little that the equalities can be measured after it; below the third, it leaves nothing. */
@@ -87,7 +89,7 @@ typedef struct {
     double *q, *points;                        /* what close and missing read: q, and (V, 3) */
     double *gone;                              /* (1) */
     const double *progress, *velocity, *spin;  /* (1), (3), (3) */
-    const double *closer, *errors, *missed;
+    const double *closer, *errors;
     double *torsions;                          /* (T) */
     double *started, *started_points, *started_torsions;   /* q and the curve before they were settled */
 
@@ -98,6 +100,20 @@ typedef struct {
     int flag, iterations, held;
     double *work;
 } Fused;
+
+/* The number of free coordinates of the curve. */
+static int free_of(const Fused *f)
+{
+    return f->unknowns - 1 - f->slacks - f->actuators;
+}
+
+/* The greatest slack of the tip in the answer. */
+static double tip_slack(const Fused *f)
+{
+    double most = 0.0;
+    for (int k = f->unknowns - 1 - f->slacks; k < f->unknowns - 1; k++) most = fmax(most, f->x[k]);
+    return most;
+}
 
 /* Working sets that are tried before DAQP; a multiplier that is no rounding, and residuals of a good answer. */
 enum { GUESSES = 4 };
@@ -188,19 +204,18 @@ static void row_over(const Fused *f, const double *part, const int *nodes, int c
    the row's weight. */
 static void stack_row(Fused *f, int k, const double *sum, const double *curve, double constant)
 {
-    int count = f->actuators, rows = f->squares, free = f->unknowns - 1 - count;
+    int count = f->actuators, rows = f->squares, free = free_of(f);
     double weight = f->row_weight[k], *to = f->stack + (f->twists ? 0 : f->nodes) + k;
     for (int i = 0; i < count; i++) to[i * rows] = weight * sum[1 + i];
     for (int i = 0; i < free; i++) to[(count + i) * rows] = weight * curve[i];
-    to[(count + free) * rows] = weight * (constant + sum[0]);
+    to[(f->unknowns - 1) * rows] = weight * (constant + sum[0]);
 }
 
 /* A row (D) over all coordinates of the curve as one over the free ones, to `curve`; return its value for the offset. */
 static double free_row(const Fused *f, const double *row, double *curve)
 {
-    int free = f->unknowns - 1 - f->actuators;
     curve[0] = dot(row + 3, f->normal, 3);
-    memcpy(curve + 1, row + 6, sizeof(double) * (free - 1));
+    memcpy(curve + 1, row + 6, sizeof(double) * (free_of(f) - 1));
     return dot(row, f->offset, 3 * f->vertices);
 }
 
@@ -276,6 +291,7 @@ static void compose(Fused *f)
         row_over(f, part, f->tip_node, f->tip_nodes, 1, sum);
         memset(row, 0, sizeof(double) * n);
         memcpy(row, sum + 1, sizeof(double) * count);
+        for (int i = 0; i < f->slacks; i++) row[last - f->slacks + i] = i == k ? 1.0 : i == f->tips + k ? -1.0 : 0.0;
         row[last] = -f->tip_rate[k];
         f->lower[n + k] -= sum[0];
         f->upper[n + k] -= sum[0];
@@ -322,7 +338,7 @@ static void node_rate(Fused *f)
    of the curve and the actuators. Equalities have no weight. */
 static void objective(Fused *f)
 {
-    int n = f->unknowns, count = f->actuators, rows = f->squares, last = n - 1, curve = last - count;
+    int n = f->unknowns, count = f->actuators, rows = f->squares, last = n - 1, curve = free_of(f);
     double *free_rows = f->work, *H = f->hessian, *g = f->gradient;
     memset(H, 0, sizeof(double) * n * n);
     memset(g, 0, sizeof(double) * n);
@@ -349,6 +365,10 @@ static void objective(Fused *f)
     for (int k = 0; k < n; k++) H[last * n + k] = H[k * n + last] = 0.0;
     H[last * n + last] = f->curvature[0];
     for (int k = 0; k < count; k++) H[k * n + k] += f->actuator_weight[k];
+    for (int k = 0, at = count + curve; k < f->slacks; k++, at++) {
+        H[at * n + at] += f->slack_weight[k];
+        g[at] += f->slack_pull[k];
+    }
     if (!curve) return;
     int size = 5 + curve;
     for (int i = 0; i < curve; i++)
@@ -381,7 +401,7 @@ static void constrain(Fused *f)
     }
     for (int k = 0; k < f->legs; k++, row += n, lower++) {
         memset(row, 0, sizeof(double) * n);
-        memcpy(row + count, f->leg_rows + k * (last - count), sizeof(double) * (last - count));
+        memcpy(row + count, f->leg_rows + k * free_of(f), sizeof(double) * free_of(f));
         *lower = f->leg_lower[k];
     }
     double *sum = f->work;
@@ -632,7 +652,7 @@ static int hold(Fused *f)
     int n = f->unknowns, m = f->tips + f->hard, size = 0, is_same = 1, column;
     if (!begun(f)) return 0;
     for (int k = 0; k < n; k++) {
-        if (k < n - 1
+        if (k < n - 1 - f->slacks
             && (k >= f->actuators || (f->x[k] > f->lower[k] + f->at_bound && f->x[k] < f->upper[k] - f->at_bound)))
             continue;
         if ((column = column_of(f, k)) < 0) return 0;
@@ -671,18 +691,18 @@ static void change_by(const Fused *f, const double *missing, double *change)
 /* The product of two changes of the unknowns, whose torsions count as lengths. */
 static double measured(const Fused *f, const double *a, const double *b)
 {
-    int n = f->unknowns, T = f->torsion, first = n - 1 - T;
+    int n = f->unknowns, T = f->torsion, first = f->actuators + free_of(f) - T;
     double product = dot(a, b, n);
     return T ? product + (f->lever * f->lever - 1.0) * dot(a + first, b + first, T) : product;
 }
 
-/* Settle q and the curve: quantities exact, equalities satisfied. Each iteration closes the quantities by a step of
-   Newton's method, and then corrects the equalities: closing again in between would not change what they miss. Steps (n)
-   after the first have Broyden's updates of the gain, in the form that needs the steps alone. */
-EXPORT int settle(Fused *f)
+/* Settle q and the curve: quantities exact, equalities satisfied unless these are let go. Each iteration closes the
+   quantities by a step of Newton's method, and then corrects the equalities: closing again in between would not change
+   what they miss. Steps (n) after the first have Broyden's updates of the gain, in the form that needs the steps alone. */
+static int settle_all(Fused *f, int lets_go)
 {
     int n = f->unknowns, m = f->tips + f->hard, steps = 0, may_correct = 1, is_measured = 0, is_closed = 0;
-    double *step = f->work + f->nodes + SUMS * (f->actuators + 1) + n * f->squares;
+    double *step = f->work + f->nodes + SUMS * (f->actuators + 1) + n * f->squares, *missed = f->missing.res[0];
     for (int count = 0; count <= f->closing_steps + f->settling_steps; count++) {
         if (call(&f->close)) return UNSETTLED;
         /* The norm is NaN if one of the errors is. */
@@ -698,7 +718,7 @@ EXPORT int settle(Fused *f)
         if (f->curve_nodes.eval && (call(&f->curve_nodes) || *f->nodes_are_right != 1.0)) return NO_VALUE;
         if (call(&f->missing)) return UNSETTLED;
         f->off = 0.0;
-        for (int k = 0; k < m; k++) f->off += f->levers[k] * f->missed[k] * f->levers[k] * f->missed[k];
+        for (int k = 0; k < m && !lets_go; k++) f->off += f->levers[k] * missed[k] * f->levers[k] * missed[k];
         f->off = sqrt(f->off);
         if (!(f->off <= f->start)) return UNSETTLED;
         is_measured = 1;
@@ -708,7 +728,7 @@ EXPORT int settle(Fused *f)
             continue;
         }
         double *next = step + steps * n;
-        change_by(f, f->missed, next);
+        change_by(f, missed, next);
         for (int k = 0; k < steps; k++) {
             const double *before = step + k * n;
             double share = measured(f, before, next) / measured(f, before, before);
@@ -722,6 +742,22 @@ EXPORT int settle(Fused *f)
         is_measured = 0;
     }
     return is_measured && (is_closed || f->errors[0] <= f->member) && f->off <= f->tip ? DONE : UNSETTLED;
+}
+
+/* The same, from where the answer led. */
+EXPORT int settle(Fused *f)
+{
+    memcpy(f->started, f->q, sizeof(double) * f->coordinates);
+    memcpy(f->started_points, f->points, sizeof(double) * 3 * f->vertices);
+    memcpy(f->started_torsions, f->torsions, sizeof(double) * f->torsion);
+    double slack = tip_slack(f);
+    /* An elastic tip with a slack is not moved. */
+    int code = slack > f->on_path ? UNSETTLED : settle_all(f, 0);
+    if (code != UNSETTLED || !(slack > f->tip)) return code;
+    memcpy(f->q, f->started, sizeof(double) * f->coordinates);
+    memcpy(f->points, f->started_points, sizeof(double) * 3 * f->vertices);
+    memcpy(f->torsions, f->started_torsions, sizeof(double) * f->torsion);
+    return settle_all(f, 1);
 }
 
 /* The progress after a `step` from that `before`; 1 where what is left of the path at these rates is no more than `left`:
@@ -743,9 +779,6 @@ static int depart(Fused *f, const double *q, double tolerance)
     memcpy(f->points, f->condense.arg[3], sizeof(double) * 3 * f->vertices);
     if (f->torsion) memcpy(f->torsions, f->curve.arg[1], sizeof(double) * f->torsion);
     advance(f, f->x, 1);
-    memcpy(f->started, f->q, sizeof(double) * f->coordinates);
-    memcpy(f->started_points, f->points, sizeof(double) * 3 * f->vertices);
-    memcpy(f->started_torsions, f->torsions, sizeof(double) * f->torsion);
     double furthest = f->furthest;
     int code = settle(f);
     /* Not that of the last correction, which may have failed. */

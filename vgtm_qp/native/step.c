@@ -389,12 +389,14 @@ static int is_flawless(StepData *s)
         wrong += (value - s->next_values[m]) * (value - s->next_values[m]);
         k += is_actuator;
     }
-    for (int i = 0; i < s->axes; i++) {
+    /* An elastic tip with a slack need not be at its goal. */
+    int is_free = tip_slack(f) > f->tip;
+    for (int i = 0; i < s->axes && !is_free; i++) {
         double error = f->condense.arg[8][s->axis[i]] + *f->gone * f->velocity[s->axis[i]];
         for (int k = 0; k < f->tip_nodes; k++) error -= s->tip_weight[k] * x[3 * f->tip_node[k] + s->axis[i]];
         off += error * error;
     }
-    if (s->turns) {
+    if (s->turns && !is_free) {
         double error = s->unit * turn_missing(s);
         off += error * error;
     }

@@ -21,7 +21,7 @@ from vgtm_qp.arm.arm import Label
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.qp.answer import StepSolution
 from vgtm_qp.qp.layout import Layout
-from vgtm_qp.qp.numbers import StepNumbers, beyond, norm, slack_curvature
+from vgtm_qp.qp.numbers import StepNumbers, beyond, norm
 from vgtm_qp.rows.tip import unit
 
 
@@ -155,7 +155,7 @@ class FullBuilder:
         q = np.zeros(self.size)
         q[self.column["actuators"]] = numbers.actuator_gradient
         q[self.column["vertices"]] = numbers.vertex_gradient.reshape(-1)
-        q[self.column["slack"]] = layout.weights.end_effector * layout.arm.unit * layout.slack_levers
+        q[self.column["slack"]] = layout.slack_pull
         q[self.column["progress"]] = numbers.progress_gradient
         self._hessian.data[-1] = numbers.progress_curvature
 
@@ -250,7 +250,7 @@ class FullBuilder:
                     Label(f"tip slack {name.removeprefix('tip ')}{sign}", "tip slack", unit(name))
                     for name, sign in slacks
                 ],
-                sparse.diags(slack_curvature(weights.end_effector) * layout.slack_levers**2),
+                sparse.diags(layout.slack_weights),
             ),
             "progress": ([Label("progress along the path", "progress", "1")], np.ones((1, 1))),
         }

@@ -33,6 +33,7 @@ from vgtm_qp.qp.settle import (
     AT_BOUND,
     LEFT,
     MOST_STEPS,
+    ON_PATH,
     SETTLING_STEPS,
     TOO_FAR,
     WORST_CONDITION,
@@ -242,8 +243,10 @@ class FusedSolver:
             actuator_multipliers=multipliers[:count].copy(),
             clearance_multipliers=-multipliers[first : first + near] if near else _NO_NUMBERS,
             iterations=work.data.iterations,
-            torsion=x[work.torsion : -1] if self.layout.torsion else _NO_NUMBERS,
-            tip_slack=0.0,
+            torsion=x[work.torsion : work.torsion + self.layout.torsion]
+            if self.layout.torsion
+            else _NO_NUMBERS,
+            tip_slack=float(x[-1 - work.slacks : -1].max()) if work.slacks else 0.0,
         )
 
 
@@ -267,8 +270,10 @@ class FusedWorkspace:
             self.curve = curve_function(shape).kernel(compiled=compiled)
             self.curve_nodes = point_function(shape).kernel(compiled=compiled)
         self.actuators, self.equal = len(arm.actuators), equal
-        self.size, self.first_near = self.actuators + layout.free_curve + 1, equal + len(layout.legs)
-        self.torsion, self.shape = self.size - 1 - layout.torsion, arm.home_configuration.shape
+        self.slacks, self.first_near = len(layout.slack_levers), equal + len(layout.legs)
+        self.size = self.actuators + layout.free_curve + self.slacks + 1
+        self.torsion = self.actuators + layout.free_curve - layout.torsion
+        self.shape = arm.home_configuration.shape
         symbols = arm.symbols(Constants())
         self._stages = symbols.elimination()
         moves_by_twists = symbols.twists(ca.MX.sym("q", *symbols.shape)) is not None
@@ -458,7 +463,6 @@ class FusedWorkspace:
             spin=condense.inputs[11],
             closer=close.outputs[0],
             errors=close.outputs[2],
-            missed=missing.outputs[0],
             torsions=self.torsions,
             started=self.started,
             started_points=self.started_points,
@@ -549,8 +553,12 @@ def _numbers(layout: Layout) -> dict[str, Any]:
         "by_nodes": int(by_nodes),
         "scale": 1.0 / float(np.sqrt(layout.weights.node_rate)),
         "actuator_weight": layout.actuator_weights,
+        "slacks": len(layout.slack_levers),
+        "slack_pull": layout.slack_pull,
+        "slack_weight": layout.slack_weights,
         "at_bound": AT_BOUND * arm.fineness,
         "left": LEFT * arm.fineness,
+        "on_path": ON_PATH * arm.fineness,
         "levers": layout.levers,
         "lever": arm.unit,
         "worst_condition": WORST_CONDITION,

@@ -32,10 +32,10 @@ def row_function(layout: Layout) -> Bound:
     """Return the function that linearises the QP of a step; C condenses it.
 
     Arguments are ``StepGraph.inputs``. :data:`RESULTS`: J_u (n_e, 3K) and the path's rate (n_e); lower and upper bounds
-    (n_a + q + 1 + n_e) of the unknowns and of the tip rows, which are those of J_u d_rho less the rate times d_alpha;
-    gradient of the terms that are no least squares (n_a + q + 1); curvature of the progress; offsets (3, V) of the
-    control vertices; base normal (3); rows (q, G) and bounds (G) of the legs. Then, one block a tracked station, gaps
-    (3, K), turns (R, K), the rows of the turns over the station's nodes (R, 9 K) and over the curve
+    (n + n_e) of unknowns and tip rows, which are those of J_u d_rho less the rate times d_alpha; gradient (n)
+    of the terms that are no least squares, but for the slacks' penalty; curvature of the progress; offsets (3, V) of
+    the control vertices; base normal (3); rows (q, G) and bounds (G) of the legs. Then, one block a tracked station,
+    gaps (3, K), turns (R, K), the rows of the turns over the station's nodes (R, 9 K) and over the curve
     (``StationSymbols.curve``); stretches (S); displacements (3, N) of nodes with the base.
 
     Last the motion of the free nodes: where actuators move nodes by twists, the twists (6, n_a) and the free nodes at
@@ -46,7 +46,9 @@ def row_function(layout: Layout) -> Bound:
     centring = graph.table("centring", layout.centring_weights)
     free, motion = layout.free_curve, graph.motion
     home = graph.symbols.home[arm.actuators.tolist()]
-    unbounded = ca.DM.ones(free) * UNBOUNDED
+    unbounded, slack = ca.DM.ones(free) * UNBOUNDED, ca.DM.ones(len(layout.slack_levers)) * UNBOUNDED
+    # An elastic tip is on time.
+    least = 1.0 - graph.progress if layout.elastic_tip else -graph.progress
     twists = graph.symbols.twists(graph.at)
     if twists is None:
         moving = graph.symbols.motion(graph.q, graph.at, graph.moved)
@@ -57,11 +59,12 @@ def row_function(layout: Layout) -> Bound:
         [
             graph.tip_jacobian,
             graph.tip_rate,
-            ca.vertcat(graph.lower - graph.strokes, -unbounded, -graph.progress, graph.tip_error),
-            ca.vertcat(graph.upper - graph.strokes, unbounded, 1.0 - graph.progress, graph.tip_error),
+            ca.vertcat(graph.lower - graph.strokes, -unbounded, 0.0 * slack, least, graph.tip_error),
+            ca.vertcat(graph.upper - graph.strokes, unbounded, slack, 1.0 - graph.progress, graph.tip_error),
             ca.vertcat(
                 motion * centring * (graph.strokes - home),
                 _curve_gradient(graph),
+                0.0 * slack,
                 progress_gradient(graph.curvature, graph.progress),
             ),
             graph.curvature,

@@ -38,6 +38,8 @@ def with_angles(weights: Weights, arm: Arm) -> Weights:
 _REACH = 0.03
 """Greatest part of a gap that a step closes in a layout that gives way, over the arm's unit."""
 
+_SLACK_CURVATURE, _LEAST_PENALTY = 1e-5, 0.1
+
 _FIRM = 1e3
 """Least weight of gaps that give way: far above the null-space terms, so that only other rows open gaps."""
 
@@ -219,6 +221,21 @@ class Layout:
     def slack_levers(self) -> Array:
         """Such lengths for the slacks of an elastic tip, above its goal and then below; otherwise empty."""
         return np.tile(self.tip_levers, 2 if self.elastic_tip else 0)
+
+    @property
+    def slack_pull(self) -> Array:
+        """Gradient of the slacks' penalty."""
+        return np.asarray(self.weights.end_effector * self.arm.unit * self.slack_levers)
+
+    @property
+    def slack_weights(self) -> Array:
+        """Curvature of the slacks' penalty, which is linear by itself, for solvers of strictly convex QPs.
+
+        A dual method starts at the unconstrained minimum, where a slack is the ratio of penalty to curvature. The
+        slack's rounding limits the accuracy of the rows; so the curvature is scaled by the penalty.
+        """
+        curvature = _SLACK_CURVATURE * max(self.weights.end_effector, _LEAST_PENALTY)
+        return np.asarray(curvature * self.slack_levers**2)
 
     @cached_property
     def levers(self) -> Array:

@@ -177,19 +177,6 @@ class StepNumbers(RowNumbers):
         return position.reshape(-1, size), turn.reshape(-1, size)
 
 
-_SLACK_CURVATURE, _LEAST_PENALTY = 1e-5, 0.1
-
-
-def slack_curvature(penalty: float) -> float:
-    """Return the curvature of the slacks of an elastic tip, for solvers of strictly convex QPs.
-
-    The penalty itself is linear. A dual method starts at the unconstrained minimum, where a slack is the
-    ratio of penalty to curvature. The slack's rounding limits the accuracy of the rows; so the curvature is
-    scaled by the penalty.
-    """
-    return _SLACK_CURVATURE * max(penalty, _LEAST_PENALTY)
-
-
 UNBOUNDED = 1e30
 """Infinity in DAQP's bounds."""
 

@@ -33,6 +33,9 @@ TOO_FAR = 1e-2
 LEFT = 1e-8
 """Remaining path of the tip, m or rad, that counts as zero, for arms of a fineness of 1."""
 
+ON_PATH = 1e-6
+"""Slack of an elastic tip, m or rad, that counts as zero: the accuracy of solvers."""
+
 AT_BOUND = 1e-6
 """Distance from a bound below which an actuator counts as held there, m or rad, for arms of a fineness of 1."""
 

@@ -291,7 +291,7 @@ def make_engine(
     is_short = _is_short(layout)
     if layout.elastic_tip and not is_short:
         _LOG.warning(_CONDENSED_ALL_THE_SAME)
-    is_quick = not plain and not layout.elastic_tip and not layout.own
+    is_quick = not plain and not layout.own
     is_long = is_quick and compiled and prefers_sweeps(layout)
     along = chain_solver(layout, dense_solver(solver)) if is_long else None
     if along is not None and ChainEngine.serves(along):

@@ -26,17 +26,22 @@ from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.linearise import Linearisation
 from vgtm_qp.qp.numbers import StepNumbers, norm
 from vgtm_qp.qp.residual import AnswerError, FailedStepError, InfeasibleStepError
-from vgtm_qp.qp.settle import LEFT, MOST_STEPS, SETTLING_STEPS, Gain, enough_tip_error, held, missing_function
+from vgtm_qp.qp.settle import (
+    LEFT,
+    MOST_STEPS,
+    ON_PATH,
+    SETTLING_STEPS,
+    Gain,
+    enough_tip_error,
+    held,
+    missing_function,
+)
 from vgtm_qp.qp.solvers import StepSolver
 from vgtm_qp.qp.stepper import Stepper
 from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.closing import Closing
 from vgtm_qp.step.target import QPInput, Target
 from vgtm_qp.step.task import TipTask
-
-_ON_PATH = 1e-6
-"""Slack, m or rad, that counts as zero: the accuracy of solvers."""
-
 
 Spent = Callable[[str], None]
 """Adds the time since the last call to a phase."""
@@ -264,9 +269,8 @@ class GeneralEngine(Engine):
     ) -> Settled | None:
         """See :class:`Engine`; an elastic tip with a slack is not moved."""
         assert self._last is not None
-        slack = self._last[2].tip_slack
-        settled = None
-        if slack <= _ON_PATH * self.layout.arm.fineness:
+        slack, settled = self._last[2].tip_slack, None
+        if slack <= ON_PATH * self.layout.arm.fineness:
             ways = {
                 "equalities": self._by_equalities,
                 "curve": self._on_its_curve,
