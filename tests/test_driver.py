@@ -193,6 +193,14 @@ def with_an_elastic_tip_among_what_moves(problem: vq.Problem, rng: np.random.Gen
     return among_these_on_a_moving_base(with_an_elastic_tip(problem, rng), rng)
 
 
+def with_a_step_limit(problem: vq.Problem, rng: np.random.Generator) -> vq.Problem:
+    return problem.replace({"method.step_limit": 0.02 * vq.Resolver(problem).setup.arm.unit})
+
+
+def with_a_step_limit_among_what_moves(problem: vq.Problem, rng: np.random.Generator) -> vq.Problem:
+    return with_a_step_limit(among_these_on_a_moving_base(problem, rng), rng)
+
+
 BUNDLED = {
     as_it_is: ["snake_past_a_cube", "twelve_joints_past_a_crate"],
     on_a_curve_with_torsion: ["snake_past_a_cube"],
@@ -216,6 +224,13 @@ BUNDLED = {
         "twelve_joints_past_a_crate",
     ],
     with_an_elastic_tip_among_what_moves: ["five_bay_two_cubes", "snake_past_a_cube"],
+    with_a_step_limit: [
+        "five_bay_two_cubes_pointing",
+        "tetrahedral_past_a_cube",
+        "offset_joints_past_a_cube",
+        "twelve_joints_past_a_crate",
+    ],
+    with_a_step_limit_among_what_moves: ["five_bay_two_cubes", "twelve_joints_past_a_crate"],
 }
 """Names of problems, by how they are changed."""
 

@@ -1,9 +1,8 @@
 """The usual step in one call of C: from a state and its target to the next state and the proof of the way there.
 
 It takes the same step as an attempt of :mod:`vgtm_qp.step.attempt`, in a third of the time or less. What is unusual it
-leaves to that: pairs that are too near already, meshes and hulls, angles, what the tip carries, a limit of
-displacements, a path that bends within the step, rows at places between two states. Each further QP is one more call.
-See ``native/step.c``.
+leaves to that: pairs that are too near already, meshes and hulls, angles, what the tip carries, a path that bends
+within the step, rows at places between two states. Each further QP is one more call. See ``native/step.c``.
 """
 
 from __future__ import annotations
@@ -85,10 +84,7 @@ class Begun(NamedTuple):
 
 def can_drive(setup: Setup) -> bool:
     """Return whether usual steps of an arm can be taken in one call, if its ``Arm.arithmetic`` is known."""
-    layout = setup.layout
-    is_plain = layout.own is None
-    without_limits = setup.minimum_angle == 0.0 and setup.step_limit == np.inf
-    return is_plain and without_limits
+    return setup.layout.own is None and setup.minimum_angle == 0.0
 
 
 def is_cut_short(setup: Setup, move: Move) -> bool:
@@ -116,7 +112,7 @@ class Driver:
         self._held: State | None = None
         self._watch: Watch | None = None
         self.spent = np.zeros(len(PHASES))
-        self._moves = setup.base_motion is not None
+        self._moves, self._has_limit = setup.base_motion is not None, setup.step_limit < np.inf
 
     def take(self, state: State, target: Target, share: float) -> Step | Begun | None:
         """Return the step from `state`, in which no pair is too near, to the end of the target's piece of path.
@@ -280,14 +276,18 @@ class Driver:
             late=late,
             tip=Pose(tip[:3], tip[3:].reshape(3, 3)),
         )
+        if begun is None:
+            of_qps = 1, self._solver.answered(), self._rows()
+        else:
+            of_qps = begun.qps, begun.first.solution, begun.rows
+        if self._has_limit and (beyond := self._setup.too_long(then.nodes - state.nodes)):
+            return Step.stopped(state, beyond, *of_qps)
         self._held = None
         self._arrays.before[:] = block[: len(self._arrays.before)]
         self._held = then
-        progress, gap = work.data.reached, data.gap if layout.tracked.size else np.nan
-        if begun is None:
-            return self._acceptance.passed(then, progress, gap, 1, self._solver.answered(), self._rows())
-        progress *= begun.covered
-        return self._acceptance.passed(then, progress, gap, begun.qps, begun.first.solution, begun.rows)
+        progress = work.data.reached if begun is None else begun.covered * work.data.reached
+        gap = data.gap if layout.tracked.size else np.nan
+        return self._acceptance.passed(then, progress, gap, *of_qps)
 
     def _ask(self) -> None:
         """Have FCL answer the questions of this round."""
