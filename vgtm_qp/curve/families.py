@@ -294,8 +294,8 @@ def _extraction(knots: Array, degree: int, breaks: Array) -> Array:
 
 
 @cache
-def _difference(size: int, order: int) -> Array:
-    """(size - order, size) matrix of the `order`-th forward difference."""
+def difference(size: int, order: int) -> Array:
+    """Return the (size - order, size) matrix of the `order`-th forward difference; (0, size) for a small size."""
     return np.asarray(np.diff(np.eye(size), n=order, axis=0))
 
 
@@ -314,4 +314,4 @@ def bernstein(degree: int, u: ArrayLike, order: int = 0) -> Array:
     table = _binomials(low) * u**j * (1.0 - u) ** (low - j)
     if order == 0:
         return np.asarray(table)
-    return np.asarray(perm(degree, order) * (table @ _difference(degree + 1, order)))
+    return np.asarray(perm(degree, order) * (table @ difference(degree + 1, order)))

@@ -16,6 +16,7 @@ from vgtm_qp.methods.pseudoinverse import Cost, moore_penrose, null_space_vector
 from vgtm_qp.methods.resolver import MAX_CORRECTIONS, TIP_TOLERANCE
 from vgtm_qp.problem import Problem
 from vgtm_qp.rotation import rotation_from_vector
+from vgtm_qp.rows.curve import polygon_bending
 from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.setup import Setup
 
@@ -69,9 +70,7 @@ class CurveMotion:
         self._terms = {name: float(getattr(gains, name)) for name in names}
         self._weights = family.weights(self.s)
         self._spacing = np.linalg.norm(np.diff(centres, axis=0), axis=1)
-        vertices = spec.control_vertices
-        second = np.diff(np.eye(vertices), n=2, axis=0) if vertices > 2 else np.zeros((0, vertices))
-        self._bending = np.kron(second.T @ second, np.eye(3))
+        self._bending = np.kron(polygon_bending(spec.control_vertices), np.eye(3))
         self._base_rows = np.zeros((BASE_ROWS, self.home.coordinates))
         self._base_rows[:3, :3] = np.eye(3)
         self._base_rows[3:, 3:6] = base[:, :2].T

@@ -16,7 +16,7 @@ import numpy as np
 
 from vgtm_qp.arm.symbols import Bound, Constants
 from vgtm_qp.arrays import Array
-from vgtm_qp.curve.families import CurveFamily, within
+from vgtm_qp.curve.families import CurveFamily, difference, within
 
 _CELLS = 32
 """Least number of cells of the quadratures."""
@@ -366,9 +366,11 @@ def _bernstein(degree: int, u: ca.SX) -> list[ca.SX]:
         others.append(others[-1] * (1 - u))
     tables = []
     for order in range(3):
-        low, difference = degree - order, np.diff(np.eye(degree + 1), n=order, axis=0)
+        low = degree - order
         values = [comb(low, j) * powers[j] * others[low - j] for j in range(low + 1)]
-        derivative = perm(degree, order) * (ca.DM(difference).T @ ca.vertcat(*values, ca.SX(0, 1)))
+        derivative = perm(degree, order) * (
+            ca.DM(difference(degree + 1, order)).T @ ca.vertcat(*values, ca.SX(0, 1))
+        )
         tables.append(ca.densify(derivative))
     return tables
 

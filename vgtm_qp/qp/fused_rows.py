@@ -8,6 +8,7 @@ from vgtm_qp.arm.symbols import Bound, Constants
 from vgtm_qp.qp.graph import StepGraph, station_rows
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.numbers import UNBOUNDED
+from vgtm_qp.rows.curve import polygon_bending
 from vgtm_qp.rows.tip import progress_gradient
 
 RESULTS = (
@@ -99,6 +100,6 @@ def _curve_gradient(graph: StepGraph) -> ca.MX:
     if not layout.vertices:
         return ca.MX.zeros(0, 1)
     curve_rate, smoothness = graph.weights(layout.weights.curve_rate, layout.weights.smoothness)
-    bend = ca.DM(layout.polygon_bending)
+    bend = ca.DM(polygon_bending(layout.vertices))
     pull = curve_rate * graph.offset + smoothness * ((graph.offset + graph.motion * graph.vertices) @ bend)
     return ca.vertcat(ca.dot(pull[:, 1], graph.normal), ca.vec(pull[:, 2:]), ca.MX.zeros(layout.torsion))

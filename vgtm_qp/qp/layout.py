@@ -16,6 +16,7 @@ from vgtm_qp.curve.families import CurveFamily
 from vgtm_qp.problem.method import Weights
 from vgtm_qp.qp.shape import CurveShape
 from vgtm_qp.qp.terms import OwnTerms
+from vgtm_qp.rows.curve import polygon_bending
 from vgtm_qp.rows.tip import axes as tip_axes
 from vgtm_qp.rows.tip import levers
 
@@ -279,7 +280,7 @@ class Layout:
         """(V, V) Hessian, per axis, of the objectives in the control vertices alone."""
         drawn = np.isin(np.arange(self.vertices), self.vertex_goals) * self.weights.vertex_goal
         rate = self.weights.curve_rate * np.eye(self.vertices)
-        return np.asarray(rate + self.weights.smoothness * self.polygon_bending + np.diag(drawn))
+        return np.asarray(rate + self.weights.smoothness * polygon_bending(self.vertices) + np.diag(drawn))
 
     @cached_property
     def curve_hessian(self) -> Array:
@@ -304,15 +305,9 @@ class Layout:
 
     def vertex_gradient(self, vertices: Array, goals: Array | None) -> Array:
         """Return (V, 3) the gradient of the curve's objectives at control vertices and goals (V, 3), m."""
-        return self.weights.smoothness * (self.polygon_bending @ vertices) + self.goal_pull(vertices, goals)
-
-    @cached_property
-    def polygon_bending(self) -> Array:
-        """(V, V) D'D with D the second difference of the control vertices."""
-        second = (
-            np.diff(np.eye(self.vertices), n=2, axis=0) if self.vertices > 2 else np.zeros((0, self.vertices))
+        return self.weights.smoothness * (polygon_bending(self.vertices) @ vertices) + self.goal_pull(
+            vertices, goals
         )
-        return np.asarray(second.T @ second)
 
 
 def curve_record(layout: Layout) -> dict[str, Any] | None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from vgtm_qp.arrays import Array
+from vgtm_qp.curve.families import difference
 
 _TINY = 1e-300
 _STRAIGHTENS = 1e-6
@@ -46,6 +48,13 @@ def legs(vertices: Any, normal: Any, least: Any, *, both: bool) -> tuple[Any, An
     return ca.horzcat(*axes), ca.fmin(least - ca.vertcat(*lengths), 0.0)
 
 
+@cache
+def polygon_bending(vertices: int) -> Array:
+    """Return (V, V) D'D with D the second difference of the control vertices."""
+    second = difference(vertices, 2)
+    return np.asarray(second.T @ second)
+
+
 def fitted(
     weights: Array, points: Array, start: Array, normal: Array, end: tuple[Array, Array] | None = None
 ) -> Array:
@@ -56,7 +65,7 @@ def fitted(
     """
     vertices = weights.shape[1]
     basis = free_basis(normal, 3 * vertices)
-    second = np.diff(np.eye(vertices), n=2, axis=0)
+    second = difference(vertices, 2)
     rows = np.kron(np.vstack([weights, _STRAIGHTENS * second]), np.eye(3)) @ basis
     away = np.vstack([points - start, np.zeros((len(second), 3))]).ravel()
     if end is not None:
