@@ -16,7 +16,7 @@ from vgtm_qp.methods.pseudoinverse import Cost, moore_penrose, null_space_vector
 from vgtm_qp.methods.resolver import MAX_CORRECTIONS, TIP_TOLERANCE
 from vgtm_qp.problem import Problem
 from vgtm_qp.rotation import rotation_from_vector
-from vgtm_qp.rows.curve import polygon_bending
+from vgtm_qp.rows.curve import polygon_bending, spacings
 from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.setup import Setup
 
@@ -68,7 +68,7 @@ class CurveMotion:
         names = DEFAULT_TERMS if method.null_space is None else method.null_space
         gains = method.gains
         self._terms = {name: float(getattr(gains, name)) for name in names}
-        self._weights = family.weights(self.s)
+        self._node_rows = self.home.position_jacobian(self.s)
         self._spacing = np.linalg.norm(np.diff(centres, axis=0), axis=1)
         self._bending = np.kron(polygon_bending(spec.control_vertices), np.eye(3))
         self._base_rows = np.zeros((BASE_ROWS, self.home.coordinates))
@@ -129,13 +129,10 @@ class CurveMotion:
         rate = rate or (1.0 if set(self._terms) <= {"obstacle_potential"} else 1e-9)
         area = self._setup.arm.unit**2
         hessian[np.diag_indices_from(hessian)] += rate * np.where(np.arange(size) < vertices, 1.0, area)
-        legs = np.diff(self._weights @ p, axis=0)
-        lengths = np.linalg.norm(legs, axis=1)
         if gain := self._terms.get("spacing"):
-            rows = np.einsum("kv,kc->kvc", np.diff(self._weights, axis=0), legs / lengths[:, None])
-            rows = rows.reshape(len(legs), vertices)
-            hessian[:vertices, :vertices] += gain * rows.T @ rows
-            gradient[:vertices] += gain * rows.T @ (lengths - self._spacing)
+            distance, rows = spacings(curve.position(self.s), self._node_rows)
+            hessian += gain * rows.T @ rows
+            gradient += gain * rows.T @ (distance - self._spacing)
         if gain := self._terms.get("smoothness"):
             hessian[:vertices, :vertices] += gain * self._bending
             gradient[:vertices] += gain * self._bending @ (p - self.home.control_vertices).ravel()

@@ -17,6 +17,7 @@ import numpy as np
 from vgtm_qp.arm.symbols import Bound, Constants
 from vgtm_qp.arrays import Array
 from vgtm_qp.curve.families import CurveFamily, difference, within
+from vgtm_qp.rows.curve import spacing
 
 _CELLS = 32
 """Least number of cells of the quadratures."""
@@ -328,17 +329,12 @@ class _CurveGraph:
         home, size = self._shape.spacing, position_rows.shape[0]
         if home is None:
             return [ca.MX(0, 1), ca.MX(size, 0)]
-        first = ca.DM.zeros(size, 3)
-        first[:3, :] = ca.DM.eye(3)
         points = ca.horzcat(self._vertices[:, 0], self.position)
-        rows = ca.horzcat(first, position_rows)
-        a, b = ca.MX.sym("a", 3), ca.MX.sym("b", 3)
-        of_a, of_b = ca.MX.sym("of_a", size, 3), ca.MX.sym("of_b", size, 3)
-        distance = ca.norm_2(b - a)
-        function = ca.Function(
-            "spacing", [a, b, of_a, of_b], [distance, (of_b - of_a) @ ((b - a) / distance)]
-        )
-        lengths, changes = function.map(len(home))(points[:, :-1], points[:, 1:], rows[:, :-3], rows[:, 3:])
+        rows = ca.horzcat(np.eye(size, 3), position_rows)
+        chord, change = ca.MX.sym("chord", 3), ca.MX.sym("change", size, 3)
+        function = ca.Function("spacing", [chord, change], spacing(ca.vertsplit(chord), ca.horzsplit(change)))
+        pieces = points[:, 1:] - points[:, :-1], rows[:, 3:] - rows[:, :-3]
+        lengths, changes = function.map(len(home))(*pieces)
         return [lengths.T - self._constants.add("spacing", home), changes]
 
 

@@ -12,6 +12,7 @@ from vgtm_qp.arrays import Array
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.curve.curve import Curve
 from vgtm_qp.qp.curve_rows import CurvePlacing, curve_function, point_function
+from vgtm_qp.rows.curve import spacings
 
 
 class CurveRows(NamedTuple):
@@ -117,13 +118,10 @@ class CurveShape(CurvePlacing):
         position = curve.position(s)
         spacing, spacing_rows = np.zeros(0), np.zeros((0, curve.coordinates))
         if self.spacing is not None:
-            start = np.zeros((1, 3, curve.coordinates))
-            start[0, range(3), range(3)] = 1.0
-            steps = np.diff(np.vstack([vertices[:1], position]), axis=0)
-            distance = np.linalg.norm(steps, axis=1)
-            change = np.diff(np.concatenate([start, position_rows]), axis=0)
+            points = np.vstack([vertices[:1], position])
+            rows = np.concatenate([np.eye(3, curve.coordinates)[None], position_rows])
+            distance, spacing_rows = spacings(points, rows)
             spacing = distance - self.spacing
-            spacing_rows = np.einsum("kc,kcd->kd", steps / distance[:, None], change)
         return CurveRows(position, position_rows, frame, spin_rows, spacing, spacing_rows)
 
     @cached_property

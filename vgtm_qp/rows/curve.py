@@ -55,6 +55,21 @@ def polygon_bending(vertices: int) -> Array:
     return np.asarray(second.T @ second)
 
 
+def spacing(chord: Any, change: Any) -> tuple[Any, Any]:
+    """Return the distance of two points, m, and its row: of symbols, or of arrays for many pairs at once.
+
+    Three components of the `chord` from one to the other, m, and three rows by which it changes.
+    """
+    distance = sum(component**2 for component in chord) ** 0.5
+    return distance, sum(row * (component / distance) for row, component in zip(change, chord, strict=True))
+
+
+def spacings(points: Array, rows: Array) -> tuple[Array, Array]:
+    """Return the distances (K - 1,) of successive points (K, 3), m, and their rows (K - 1, D) from those (K, 3, D)."""
+    distance, changes = spacing(np.diff(points, axis=0).T[..., None], np.diff(rows, axis=0).swapaxes(0, 1))
+    return distance[:, 0], changes
+
+
 def fitted(
     weights: Array, points: Array, start: Array, normal: Array, end: tuple[Array, Array] | None = None
 ) -> Array:
