@@ -15,18 +15,21 @@ def gap(centre: Any, point: Any) -> Any:
 def turns(rotation: Any, frame: Any, count: int) -> tuple[Any, Any]:
     """Return the turns (R,) between a station's and the curve's frame (3, 3), and c (R, 3).
 
-    They are eq. (39) for theta(s, p). The first two are cosines between the station's x- and y-axes and the tangent,
-    the third the sine of the roll. Each depends on the relative rotation alone: its rate is c . (angular velocity of
-    the station less that of the curve's frame).
+    They are eq. (39) for theta(s, p). The first two are :func:`tilts`, the third the sine of the roll. Each depends on
+    the relative rotation alone: its rate is c . (angular velocity of the station less that of the curve's frame).
     """
-    x, y, tangent = rotation[:, 0], rotation[:, 1], frame[:, 2]
-    residual = [ca.dot(x, tangent), ca.dot(y, tangent)]
-    along = [ca.cross(x, tangent), ca.cross(y, tangent)]
-    if count == 3:
-        first, second = frame[:, 0], frame[:, 1]
-        residual.append((ca.dot(x, second) - ca.dot(y, first)) / 2)
-        along.append((ca.cross(x, second) - ca.cross(y, first)) / 2)
-    return ca.vertcat(*residual), ca.horzcat(*along).T
+    tilt, c = tilts(rotation, frame[:, 2])
+    if count == 2:
+        return tilt, c
+    x, y, first, second = rotation[:, 0], rotation[:, 1], frame[:, 0], frame[:, 1]
+    roll = (ca.dot(x, second) - ca.dot(y, first)) / 2
+    return ca.vertcat(tilt, roll), ca.vertcat(c, ((ca.cross(x, second) - ca.cross(y, first)) / 2).T)
+
+
+def tilts(rotation: Any, tangent: Any) -> tuple[Any, Any]:
+    """Return the cosines (2,) between a station's x- and y-axes and the tangent (3,), and c (2, 3) of :func:`turns`."""
+    axes = rotation[:, :2]
+    return axes.T @ tangent, ca.horzcat(*(ca.cross(axis, tangent) for axis in ca.horzsplit(axes))).T
 
 
 def within(error: Any, reach: float) -> Any:
@@ -36,13 +39,11 @@ def within(error: Any, reach: float) -> Any:
 
 
 def slope_rows(rotation: Any, slope: Any) -> tuple[Any, Any, Any]:
-    """Return the two tilts (2,), c (2, 3) as :func:`turns` does, and the tilts' rows (2, 3) over the slope r' (3,).
+    """Return :func:`tilts` (2,), their c (2, 3), and the tilts' rows (2, 3) over the slope r' (3,).
 
     A curve without roll turns with its tangent alone: dt = (1 - t t') dr' / |r'|, and c . (t x dt) = -axis . dt.
     """
     slowness = 1.0 / ca.norm_2(slope)
     tangent = slope * slowness
-    axes = rotation[:, :2].T
-    tilt = axes @ tangent
-    c = ca.horzcat(*(ca.cross(rotation[:, a], tangent) for a in range(2))).T
-    return tilt, c, (axes - tilt @ tangent.T) * slowness
+    tilt, c = tilts(rotation, tangent)
+    return tilt, c, (rotation[:, :2].T - tilt @ tangent.T) * slowness
