@@ -44,7 +44,7 @@ def compare(layout, seeds=range(1)):
             legs, least = results["leg_rows"], results["leg_lower"]
             numbers = linearisation.numbers(asked, rows)
             basis = free_basis(results["normal"], 3 * layout.vertices + layout.torsion)
-            of_legs = np.pad(numbers.legs.over_vertices(layout), ((0, 0), (0, layout.torsion)))
+            of_legs = np.pad(numbers.legs.rows, ((0, 0), (0, layout.torsion)))
             np.testing.assert_allclose(
                 legs.reshape(len(least), layout.free_curve), of_legs @ basis, atol=1e-12
             )

@@ -75,10 +75,12 @@ def make_case(name, curve="elastic", *, seed=0, rows=5, joint_offset=0.0):
     if vertices:
         curve_step[0] = shift
         curve_step[1] = shift + 0.01 * np.cross(axes[0], axes[1]) + base_rhs @ axes
-    leg_axes = np.zeros((len(layout.legs), 3))
-    leg_axes[:1] = np.cross(axes[0], axes[1])
-    leg_axes[1:, 2] = 1.0
-    leg_change = curve_step[layout.legs[:, 1]] - curve_step[layout.legs[:, 0]]
+    leg_rows = np.zeros((len(layout.legs), vertices, 3))
+    for row, (start, end) in zip(leg_rows, layout.legs, strict=True):
+        row[end] = [0.0, 0.0, 1.0] if start else np.cross(axes[0], axes[1])
+        row[start] = -row[end]
+    leg_change = np.einsum("gvc,vc->g", leg_rows, curve_step)
+    leg_rows = leg_rows.reshape(len(leg_rows), 3 * vertices)
     centres = np.einsum("kf,kfc->kc", truss.face_weights[layout.tracked], nodes[truss.faces[layout.tracked]])
     tip_jacobian = np.kron(truss.tip_weights, np.eye(3))[task.axes]
     tip_rate = rng.normal(size=len(layout.tip_rows))
@@ -124,7 +126,7 @@ def make_case(name, curve="elastic", *, seed=0, rows=5, joint_offset=0.0):
             value - rng.uniform(0.0, 0.01, rows),
             lambda k: f"clearance: row {k}",
         ),
-        legs=Legs(leg_axes, np.einsum("gc,gc->g", leg_axes, leg_change) - rng.uniform(0.0, 0.02)),
+        legs=Legs(leg_rows, leg_change - rng.uniform(0.0, 0.02)),
     )
     return layout, numbers
 

@@ -152,7 +152,9 @@ def test_rows_of_the_full_qp_linearise_what_they_say(name, track, joint_offset, 
     wanted = np.where(truss.actuated, 0.0, lengths)
     # A leg grows by what its ends move along it.
     legs = np.diff(vertex_step, axis=0)[scene.layout.legs[:, 0]]
-    normal = scene.kinematics.station_rotation[0][:, 2] if scene.target.base is None else numbers.legs.axes[0]
+    normal = (
+        scene.kinematics.station_rotation[0][:, 2] if scene.target.base is None else numbers.legs.rows[0, 3:6]
+    )
     last = np.diff(scene.vertices, axis=0)[-1]
     axes = np.array([normal, last / np.linalg.norm(last)])[: len(legs)]
     grown = np.einsum("gc,gc->g", axes, legs)

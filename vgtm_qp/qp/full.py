@@ -360,10 +360,10 @@ class FullBuilder:
 
     def _leg_rows(self, vertices: Index) -> _Rows:
         """Return the rows of the legs with given directions; `vertices` (3 V,) are the vertices' columns."""
-        layout, count = self.layout, len(self.layout.legs)
+        count = len(self.layout.legs)
         labels = [Label(f"curve {name} leg", "curve leg", "m") for name in ("first", "last")[:count]]
         grid = _grid(np.arange(count), vertices)
-        entries = [_Entries(*grid, lambda numbers: numbers.legs.over_vertices(layout))]
+        entries = [_Entries(*grid, lambda numbers: numbers.legs.rows)]
         return _Rows(labels, entries, lambda numbers: numbers.legs.lower)
 
 

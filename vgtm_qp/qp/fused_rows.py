@@ -71,7 +71,7 @@ def row_function(layout: Layout) -> Bound:
             graph.curvature,
             graph.offset,
             graph.normal,
-            leg_rows(layout, graph.leg_axes),
+            leg_rows(layout, graph.leg_rows, graph.normal),
             graph.leg_lower,
             *station_rows(graph),
             motion * graph.given[4] if layout.spacings else ca.MX(0, 1),
@@ -81,17 +81,11 @@ def row_function(layout: Layout) -> Bound:
     )
 
 
-def leg_rows(layout: Layout, axes: ca.MX) -> ca.MX:
-    """Return (q, G) the rows of the legs, along `axes` (3, G), over the free coordinates of the curve."""
-    rows = ca.MX.zeros(layout.free_curve, len(layout.legs))
-    for k, (start, _) in enumerate(layout.legs.tolist()):
-        if start == 0:
-            # The first leg is along the first of the free coordinates.
-            rows[0, k] = 1.0
-            continue
-        first = 3 * start - 5
-        rows[first : first + 6, k] = ca.vertcat(-axes[:, k], axes[:, k])
-    return rows
+def leg_rows(layout: Layout, rows: ca.MX, normal: ca.MX) -> ca.MX:
+    """Return (q, G) the rows (3 V, G) of the legs over the free coordinates of the curve, given its base's normal."""
+    if not layout.vertices:
+        return rows
+    return ca.vertcat(normal.T @ rows[3:6, :], rows[6:, :], ca.MX.zeros(layout.torsion, len(layout.legs)))
 
 
 def _curve_gradient(graph: StepGraph) -> ca.MX:

@@ -45,8 +45,8 @@ class StepGraph:
         Of the stations at `q`, and at `at`.
     base_axes, normal, offset : (3, 2), (3,), (3, V)
         Axes and normal of the curve's base, and the displacements that bring the curve back to it.
-    leg_axes, leg_lower : (3, G), (G,)
-        Of the legs of ``Layout.legs``, see ``rows.curve.legs``.
+    leg_rows, leg_lower : (3 V, G), (G,)
+        Rows and bounds of the legs of ``Layout.legs``, see ``rows.curve.legs``.
     """
 
     def __init__(self, layout: Layout, symbols: ArmSymbols, constants: Constants) -> None:
@@ -113,7 +113,7 @@ class StepGraph:
     def _curve(self) -> None:
         layout, stations = self.layout, self.layout.arm.stations
         self.base_axes, self.normal = ca.MX.zeros(3, 2), ca.MX.zeros(3)
-        self.offset, self.leg_axes, self.leg_lower = ca.MX.zeros(3, 0), ca.MX.zeros(3, 0), ca.MX.zeros(0)
+        self.offset, self.leg_rows, self.leg_lower = ca.MX.zeros(3, 0), ca.MX.zeros(0, 0), ca.MX.zeros(0)
         if not layout.vertices:
             return
         home = layout.arm.home
@@ -130,7 +130,7 @@ class StepGraph:
         if len(layout.legs):
             (least,) = self.weights(layout.least_leg)
             both = len(layout.legs) > 1
-            self.leg_axes, self.leg_lower = curve_rows.legs(self.vertices, self.normal, least, both=both)
+            self.leg_rows, self.leg_lower = curve_rows.legs(self.vertices, self.normal, least, both=both)
         if layout.general is None:
             self._tables = (
                 self.table("curve_weights", layout.curve_weights),

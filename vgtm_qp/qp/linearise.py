@@ -147,7 +147,7 @@ class Linearisation:
             base_axes=base_axes,
             base_rhs=base_rhs,
             clearance=clearance,
-            legs=Legs(legs.reshape(-1, 3), least),
+            legs=Legs(legs.reshape(len(least), vertices.size), least),
             spacing_rhs=spacing if moves else 0.0 * spacing,
             curve=asked.curve,
             own=(
@@ -162,10 +162,9 @@ def linear_function(layout: Layout) -> Bound:
     """Return the function that linearises a step of `layout`.
 
     Arguments are ``StepGraph.inputs``. Results: quantities (M,), strokes (n_a,); tip error, rate (n_e,) and J_u
-    (n_e, 3K); curvature of the progress; offsets (3, V) and base axes (3, 2) of the curve; axes (3, G) and bounds (G)
-    of its legs; and, one block a tracked
-    station, gaps (3, K), turns (R, K), their rows over the stations' nodes (R, 9 K) and over the curve
-    (``StationSymbols.curve``); last, the values of ``Arm.motion_rows``.
+    (n_e, 3K); curvature of the progress; offsets (3, V) and base axes (3, 2) of the curve; rows (3 V, G) and bounds (G)
+    of its legs; and, one block a tracked station, gaps (3, K), turns (R, K), their rows over the stations' nodes
+    (R, 9 K) and over the curve (``StationSymbols.curve``); last, the values of ``Arm.motion_rows``.
     """
     constants = Constants()
     graph = StepGraph(layout, layout.arm.symbols(constants), constants)
@@ -179,7 +178,7 @@ def linear_function(layout: Layout) -> Bound:
         graph.curvature,
         graph.offset,
         graph.base_axes,
-        graph.leg_axes,
+        graph.leg_rows,
         graph.leg_lower,
         *station_rows(graph),
         *symbols.motion(graph.q, graph.at, graph.moved),

@@ -67,25 +67,16 @@ class ClearanceRows:
 
 
 class Legs(NamedTuple):
-    """The legs of the control polygon that must not reverse: axes . (displacement of their ends) >= lower, in m.
+    """The legs of the control polygon that must not reverse: rows . (displacements of its vertices) >= lower, in m.
 
     Attributes
     ----------
-    axes, lower : (G, 3), (G,)
+    rows, lower : (G, 3 V), (G,)
         Of the legs of ``Layout.legs``.
     """
 
-    axes: Array
+    rows: Array
     lower: Array
-
-    def over_vertices(self, layout: Layout) -> Array:
-        """Return (G, 3 V) the rows over the control vertices."""
-        count = np.zeros((len(layout.legs), layout.vertices))
-        at = np.arange(len(count))
-        count[at, layout.legs[:, 0]], count[at, layout.legs[:, 1]] = -1.0, 1.0
-        return np.asarray(
-            (count[:, :, None] * self.axes[:, None, :]).reshape(len(count), 3 * layout.vertices)
-        )
 
 
 @dataclass

@@ -33,19 +33,21 @@ def base_offset(centre: Any, rotation: Any, vertices: Any) -> Any:
 
 
 def legs(vertices: Any, normal: Any, least: Any, *, both: bool) -> tuple[Any, Any]:
-    """Return axes (3, G) of the first leg of the control polygon (3, V), and of the last, and bounds (G,).
+    """Return rows (3 V, G) of the first leg of the control polygon (3, V), and of the last, and bounds (G,).
 
     A leg must not shrink to zero length: it would reverse, and the curve with it. So the displacement of its
     end less that of its start, along its axis, is at least the bound, m: the leg then keeps the `least`
     length, or its own if that is less. The axis of the first leg is the base's `normal` (3,), that of the
     last its own direction.
     """
-    axes, lengths = [normal], [ca.dot(vertices[:, 1] - vertices[:, 0], normal)]
+    others = ca.MX.zeros(vertices.numel() - 6)
+    rows, lengths = [ca.vertcat(-normal, normal, others)], [ca.dot(vertices[:, 1] - vertices[:, 0], normal)]
     if both:
         last = vertices[:, -1] - vertices[:, -2]
         lengths.append(ca.norm_2(last))
-        axes.append(last / ca.fmax(lengths[1], _TINY))
-    return ca.horzcat(*axes), ca.fmin(least - ca.vertcat(*lengths), 0.0)
+        axis = last / ca.fmax(lengths[1], _TINY)
+        rows.append(ca.vertcat(others, -axis, axis))
+    return ca.horzcat(*rows), ca.fmin(least - ca.vertcat(*lengths), 0.0)
 
 
 @cache

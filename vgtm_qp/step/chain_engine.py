@@ -124,7 +124,7 @@ class ChainEngine(Engine):
             progress_gradient=progress_gradient(curvature, progress),
             progress_curvature=curvature,
             clearance=rows,
-            legs=Legs(legs.reshape(-1, 3).copy(), least.copy()),
+            legs=Legs(legs.reshape(len(least), vertices.size).copy(), least.copy()),
         )
         solution = self._solver.solve_filled(numbers)
         self._answer = solution.actuators, numbers.lower, numbers.upper

@@ -159,7 +159,7 @@ class ChainData:
 
     def leg_rows(self, legs: Legs) -> Array:
         """Return (G, 3V - 5) the rows of the legs of the control polygon over the curve's free coordinates."""
-        return legs.over_vertices(self._chain.layout) @ self._free
+        return legs.rows @ self._free
 
     def polygon_terms(self) -> tuple[Array, Array]:
         """Return Hessian (3V - 5, 3V - 5) and gradient (3V - 5,) of the terms in the vertices alone."""

@@ -26,8 +26,8 @@ class _Ends:
         Of the tip at `X`, and at `Y`.
     offset, normal : (3, V), (3,)
         Of the curve at the base, see ``ChainData``.
-    axes, least : (3, G), (G,)
-        Of the curve's legs, see ``rows.curve.legs``.
+    legs, least : (3 V, G), (G,)
+        Rows and bounds of the curve's legs, see ``rows.curve.legs``.
     """
 
     def __init__(self, layout: Layout) -> None:
@@ -40,7 +40,7 @@ class _Ends:
             frames = tip_frames(arm, self._constants, np.arange(len(tip.nodes)))
             self.rotation, self.spin = frames.rotations(self.X), frames.at(self.Y)[1]
         self.offset, self.normal = ca.MX(3, 0), ca.MX.zeros(3)
-        self.axes, self.least = ca.MX.zeros(3, 0), ca.MX.zeros(0)
+        self.legs, self.least = ca.MX.zeros(3 * vertices, 0), ca.MX.zeros(0)
         if vertices:
             home, weights = arm.home[arm.stations.nodes[:1]], ca.DM(arm.stations.weights[0])
             base = Frames(home, arm.stations.frames[:1], np.arange(3), self._constants, "base")
@@ -49,7 +49,7 @@ class _Ends:
             self.normal = turned[:, 2]
         if len(layout.legs):
             least, both = self.constant("least_leg", layout.least_leg), len(layout.legs) > 1
-            self.axes, self.least = curve_rows.legs(self.points, self.normal, least, both=both)
+            self.legs, self.least = curve_rows.legs(self.points, self.normal, least, both=both)
 
     def constant(self, name: str, *values: float) -> ca.MX:
         """Return constants as an argument that is bound once."""
@@ -61,9 +61,9 @@ class _Ends:
 
 
 def end_function(layout: Layout) -> Bound:
-    """Return the function (X, Y, base, points) -> rotation, spin, offset, normal, axes and least of :class:`_Ends`."""
+    """Return the function (X, Y, base, points) -> rotation, spin, offset, normal, legs and least of :class:`_Ends`."""
     ends = _Ends(layout)
-    results = [ends.rotation, ends.spin, ends.offset, ends.normal, ends.axes, ends.least]
+    results = [ends.rotation, ends.spin, ends.offset, ends.normal, ends.legs, ends.least]
     return ends.bound("ends", [ends.X, ends.Y, ends.base, ends.points], results)
 
 
@@ -93,7 +93,7 @@ def begin_function(layout: Layout) -> Bound:
         curvature,
         ends.offset,
         ends.normal,
-        leg_rows(layout, ends.axes),
+        leg_rows(layout, ends.legs, ends.normal),
         ends.least,
         tip_rows.progress_gradient(curvature, progress),
     ]
