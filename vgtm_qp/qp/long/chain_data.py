@@ -37,14 +37,20 @@ class ChainData:
         See ``elimination.Inputs``.
     turn_squares : (n, 9f)
         Products t t' of the rows t of ``tangent_curve``, summed over the two angles of a station.
+    starts : dict
+        The first column of each part.
     window, members, station_order : (n, w + m), (n, 3m), (n, f, 3) int
         Those of the chain, by row.
     at : (M,) int
         Places of the members in `members`.
     stations : (K,) int
         Positions in ``layout.tracked`` of the stations by row.
+    is_hard : (K, 2) bool
+        Whether gap and angles of those stations are equalities.
     weights, slopes : (K, V)
-        Of the control vertices at those stations.
+        Of the control vertices there.
+    tracking, along : float, (V, V)
+        Weight of the gaps, 0 with hard tracking; Hessian, per axis, of the terms in the vertices and of these.
     offset : (V, 3)
         Displacements of the control vertices for free coordinates of zero, m.
     normal : (3,)
@@ -55,17 +61,19 @@ class ChainData:
         self._chain, self.sizes, self.is_reversed = chain, sizes, is_reversed
         layout, order = chain.layout, slice(None, None, -1 if is_reversed else 1)
         self.part: dict[str, Array] = {}
+        self.starts: dict[str, int] = {}
         arrays = []
         for parts in sizes.values():
             ends = np.cumsum(list(parts.values())).tolist()
             arrays.append(np.zeros((chain.periods, ends[-1])))
             for (name, size), end in zip(parts.items(), ends, strict=True):
-                self.part[name] = arrays[-1][:, end - size : end]
+                self.part[name], self.starts[name] = arrays[-1][:, end - size : end], end - size
         self.head, self.tail, self.table = arrays
         self.turn_squares: Array = np.zeros((chain.periods, 9 * chain.stations.shape[1]))
         self.window, self.members = chain.window[order], chain.members[order]
         self.at = np.argsort(self.members.reshape(-1))
         self.stations, self.station_order = chain.stations[order].reshape(-1), chain.station_order[order]
+        self.is_hard = np.stack([layout.hard_gaps[:, 0], layout.hard_tilts[:, 0]], axis=1)[self.stations]
         self.weights, self.slopes = layout.curve_weights[self.stations], layout.curve_slopes[self.stations]
         self.part["weights"][:] = self.weights.reshape(self.part["weights"].shape)
         self.part["slopes"][:] = self.slopes.reshape(self.part["slopes"].shape)
@@ -76,9 +84,9 @@ class ChainData:
         self.offset, self.normal = np.zeros((layout.vertices, 3)), np.zeros(3)
         self.vertex_gradient = np.zeros((layout.vertices, 3))
         self._polygon = layout.vertex_hessian
-        self._tracking = 0.0 if layout.hard_tracking else layout.weights.tracking
-        along = self._polygon + self._tracking * self.weights.T @ self.weights
-        self._hessian, self._polygon_hessian = np.kron(along, np.eye(3)), np.kron(self._polygon, np.eye(3))
+        self.tracking = 0.0 if layout.hard_tracking else layout.weights.tracking
+        self.along = self._polygon + self.tracking * self.weights.T @ self.weights
+        self._hessian, self._polygon_hessian = (np.kron(a, np.eye(3)) for a in (self.along, self._polygon))
         self._free = free_basis(np.zeros(3), 3 * layout.vertices)
 
     def fill(self, numbers: StepNumbers) -> None:
@@ -184,7 +192,7 @@ class ChainData:
         over_slope = self.part["tangent_curve"].reshape(-1, 2, 3)
         angles = tilt[:, :1] * over_slope[:, 0] + tilt[:, 1:] * over_slope[:, 1]
         gradient = self._chain.layout.weights.tangent * self.slopes.T @ angles
-        gradient -= self._tracking * self.weights.T @ gap
+        gradient -= self.tracking * self.weights.T @ gap
         return self.polygon_gradient(vertices) + gradient.reshape(-1) @ self._free
 
     def misfit(self, vertices: Array, stations: Array) -> tuple[Array, Array]:
@@ -229,7 +237,7 @@ class PeriodValues:
     """
 
     def __init__(self, chain: Chain, data: ChainData) -> None:
-        layout, bays = chain.layout, chain.bays
+        home, bays = chain.layout.arm.home_quantities, chain.bays
         self._chain, self._data = chain, data
         self._kernel = Kernel(period_values(chain).map(chain.periods))
         for k, array in enumerate((data.head, data.tail, data.turn_squares)):
@@ -238,9 +246,8 @@ class PeriodValues:
         self._X, self._Y = (array.reshape(-1, 3) for array in inputs[:2])
         self._curve, self._motion = inputs[6].reshape(-1, 2, 6), inputs[7]
         # Two switches for each station, for gap and angles: corrections close hard rows as well.
-        self._closes, tracked = inputs[8].reshape(-1, 2), data.stations
-        self._is_hard = np.stack([layout.hard_gaps[tracked, 0], layout.hard_tilts[tracked, 0]], axis=1)
-        inputs[2][:], inputs[3][:] = layout.arm.home_quantities[data.members], ~bays.actuated[data.members]
+        self._closes = inputs[8].reshape(-1, 2)
+        inputs[2][:], inputs[3][:] = home[data.members], ~bays.actuated[data.members]
         for array, constants in zip(inputs[4:6], frame_constants_of(chain, data), strict=True):
             array[:] = constants.reshape(array.shape)
         # The first period's members stand on base nodes, which are not unknowns.
@@ -260,7 +267,7 @@ class PeriodValues:
         np.take(X, window, axis=0, out=self._X, mode="clip")
         np.take(Y, window, axis=0, out=self._Y, mode="clip")
         self._motion[:] = motion
-        self._closes[:] = self._is_hard | motion
+        self._closes[:] = data.is_hard | motion
         if len(data.stations):
             both = np.hstack([vertices, data.offset])
             np.matmul(data.weights, both, out=self._curve[:, 0])

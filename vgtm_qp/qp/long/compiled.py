@@ -20,7 +20,6 @@ from vgtm_qp.qp.long.chain_data import ChainData, frame_constants_of, period_val
 from vgtm_qp.qp.long.ends import begin_function, missing_tip_function
 from vgtm_qp.qp.long.products import products
 from vgtm_qp.qp.long.solver import PRESSES, ChainSolver
-from vgtm_qp.qp.long.sparse_symbols import offsets
 from vgtm_qp.qp.long.working_set import BLOCK, DEPENDENT, INDEPENDENT, NO_ROW
 from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.qp.residual import TOLERANCE
@@ -327,9 +326,7 @@ def _sizes(solver: ChainSolver) -> dict[str, int]:
     """Return by field how many there are of what, and where parts of a period's numbers begin."""
     layout, chain, data = solver.layout, solver.chain, solver.data
     gaps, tilts = layout.ends_at_tip and not layout.hard_tracking, layout.ends_along_tip
-    at: dict[str, int] = {}
-    for parts in data.sizes.values():
-        at |= zip(parts, offsets(parts.values())[:-1], strict=True)
+    at = data.starts
     return {
         "periods": chain.periods,
         "own": chain.own,
@@ -365,14 +362,8 @@ def _sizes(solver: ChainSolver) -> dict[str, int]:
 def _constants(solver: ChainSolver, data: ChainData) -> dict[str, Any]:
     """Return by field the tables of a chain, and the weights of its QP."""
     layout, chain, arm, weights = solver.layout, solver.chain, solver.layout.arm, solver.layout.weights
-    own, is_free = chain.nodes.shape[1], chain.node_period >= 0
     members, fixed = chain.members, ~chain.bays.actuated[chain.members]
-    places = np.argsort(members.reshape(-1))
-    moving = np.where(
-        chain.actuated, np.cumsum(np.tile(chain.actuated, (chain.periods, 1))).reshape(members.shape) - 1, -1
-    )
     base_row, base_column = np.nonzero(chain.pattern[:, : chain.before])
-    hard = np.stack([layout.hard_gaps[data.stations, 0], layout.hard_tilts[data.stations, 0]], axis=1)
     angles, alignments = frame_constants_of(chain, data)
     end = {}
     if layout.vertices:
@@ -382,13 +373,13 @@ def _constants(solver: ChainSolver, data: ChainData) -> dict[str, Any]:
         end = {"end_station": int(k), "end_node": nodes, "end_weight": np.ascontiguousarray(weight)}
     found = {
         "node": chain.nodes,
-        "node_at": np.where(is_free, (chain.node_period + 1) * own + chain.node_place, 0),
+        "node_at": solver.node_at,
         "window": chain.window,
         "entry": chain.entry,
         "member": members,
-        "stroke_at": places[arm.actuators],
-        "held_at": places[chain.locked],
-        "moving_at": moving,
+        "stroke_at": solver.strokes_at,
+        "held_at": solver.held_at,
+        "moving_at": solver.moving_at,
         "is_fixed": fixed,
         "base_entries": chain.entry[base_row, base_column],
         "live": np.array(solver.elimination.live),
@@ -398,17 +389,17 @@ def _constants(solver: ChainSolver, data: ChainData) -> dict[str, Any]:
         "fixed": fixed.astype(float),
         "angles": angles,
         "alignment": alignments,
-        "hard": hard.astype(float),
+        "hard": data.is_hard.astype(float),
         "weight": data.weights,
         "slope": data.slopes,
         "polygon": layout.vertex_hessian,
-        "along": layout.vertex_hessian + weights.tracking * data.weights.T @ data.weights,
+        "along": data.along,
         "levers": layout.tip_levers,
         "base_count": len(base_row),
         "node_rate": weights.node_rate,
         "actuator_weight": weights.actuators,
         "tangent": weights.tangent,
-        "tracking": 0.0 if layout.hard_tracking else weights.tracking,
+        "tracking": data.tracking,
         **end,
     }
     return {name: _for_c(value) for name, value in found.items()}

@@ -42,6 +42,10 @@ class ChainSolver(ABC):
     gains : list
         Matrices of the period's gains, the second result of the elimination: for their sparsity.
     dense : DenseSolver
+    strokes_at, held_at, node_at : (n_a,), (l,), (N,) int
+        Places of actuators and locked members in ``chain.members``, and of nodes after those of the base, there at 0.
+    moving_at : (n, 3m) int
+        Numbers of a period's actuated places among all of them; -1 at other places.
     """
 
     settles = "curve"
@@ -59,10 +63,12 @@ class ChainSolver(ABC):
         self.data = ChainData(chain, elimination.inputs.sizes, is_reversed=is_reversed)
         self._size, self._curve = size, elimination.curve
         self._free = np.zeros(self._curve)
-        at = np.argsort(chain.members.reshape(-1))
-        self._strokes_at, self._held_at = at[chain.bays.actuators], at[chain.locked]
-        actuated = np.cumsum(np.tile(chain.actuated, chain.periods)) - 1
-        self._among_actuated = actuated[self._strokes_at]
+        at, own = np.argsort(chain.members.reshape(-1)), chain.nodes.shape[1]
+        self.strokes_at, self.held_at = at[chain.bays.actuators], at[chain.locked]
+        numbers = np.cumsum(np.tile(chain.actuated, chain.periods)).reshape(chain.members.shape) - 1
+        self.moving_at = np.where(chain.actuated, numbers, -1)
+        self._among_actuated = self.moving_at.reshape(-1)[self.strokes_at]
+        self.node_at = np.where(chain.node_period >= 0, (chain.node_period + 1) * own + chain.node_place, 0)
         self._active: set[Key] = set()
         self._last: tuple[RowTable, Answer] | None = None
 
@@ -128,10 +134,10 @@ class ChainSolver(ABC):
         nodal = weights.node_rate * nodes + table.nodal_forces(multipliers)
         strokes = values[table.actuators]
         forces = np.zeros(self.chain.bays.member_count)
-        forces[self._strokes_at] = (
+        forces[self.strokes_at] = (
             weights.actuators * strokes + table.numbers.actuator_gradient + multipliers[table.actuators]
         )
-        forces[self._held_at] = multipliers[table.locked]
+        forces[self.held_at] = multipliers[table.locked]
         left, dual = self._residuals(nodes, vertices, strokes, nodal, forces.reshape(self.chain.periods, -1))
         if self._curve:
             dual[-self._curve :] += table.curve_forces(multipliers)

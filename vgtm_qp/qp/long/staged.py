@@ -53,10 +53,9 @@ class StagedSolver(ChainSolver):
         is_free = chain.node_period >= 0
         first = np.where(is_free, periods - 1 - chain.node_period, periods) * BLOCK * own
         self._row_place = first + chain.node_place * is_free
-        # After the free nodes comes a row of zeros for base nodes, which do not move.
-        self._moved = np.zeros((chain.nodes.size + 1, 3))
-        self._forward.bind_output(1, self._moved[:-1])
-        self._moved_at = np.where(is_free, chain.node_period * own + chain.node_place, -1)
+        # First the rows of base nodes, which do not move.
+        self._moved = np.zeros(((periods + 1) * own, 3))
+        self._forward.bind_output(1, self._moved[own:])
         self._outer = self._factor.outputs[2].reshape(self._freedom, -1)
         self._fixed = ~chain.bays.actuated[chain.members.reshape(-1)]
 
@@ -132,14 +131,14 @@ class StagedSolver(ChainSolver):
         self._motions[:] = motions.reshape(self.chain.periods, -1)[::-1]
         self._forward()
         changed = self._forward.outputs[2]
-        return self._moved_by, changed.take(self._strokes_at), changed[self._held_at]
+        return self._moved_by, changed.take(self.strokes_at), changed[self.held_at]
 
     def _moved_by(self, nodes: Index) -> Array:
-        return self._moved[self._moved_at[nodes]]
+        return self._moved[self.node_at[nodes]]
 
     def displacements(self) -> Array:
         """See ``ChainSolver``."""
-        return self._moved.take(self._moved_at, axis=0)
+        return self._moved.take(self.node_at, axis=0)
 
     def _eliminate(self) -> None:
         """Run the recursion and factorise the remaining Hessian, in the curve's coordinates."""

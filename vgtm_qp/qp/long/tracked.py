@@ -116,8 +116,6 @@ class TrackedSolver(ChainSolver):
         else:
             self._moving = self._following.carry.reshape(self._moving.shape)
         self._moved = self._moving[own:].reshape(-1, columns)
-        is_free = chain.node_period >= 0
-        self._place = np.where(is_free, (chain.node_period + 1) * own + chain.node_place, 0)
         self._one = np.ones(columns)
 
     def functions(self) -> dict[str, ca.Function]:
@@ -134,7 +132,7 @@ class TrackedSolver(ChainSolver):
         return ChainClosing(self.chain, self._graphs.hold(), self.data.head, self._following.outputs[1])
 
     def _columns(self, nodes: Index, coefficients: Array, curve: Array) -> Array:
-        moved = self._moving.take(self._place[nodes], axis=0)
+        moved = self._moving.take(self.node_at[nodes], axis=0)
         rows = np.einsum("rqc,rqcn->nr", coefficients, moved[..., :-1]) + curve.T
         return np.asarray(dtrtrs(self._factor, rows, lower=1)[0])
 
@@ -144,12 +142,12 @@ class TrackedSolver(ChainSolver):
         return self._moved_by, (self._strokes @ self._one).take(self._among_actuated), np.zeros(0)
 
     def _moved_by(self, nodes: Index) -> Array:
-        return self._moving.take(self._place[nodes], axis=0) @ self._one
+        return self._moving.take(self.node_at[nodes], axis=0) @ self._one
 
     def displacements(self) -> Array:
         """See ``ChainSolver``."""
         moved = self._moving.reshape(-1, len(self._one)) @ self._one
-        return moved.reshape(-1, 3).take(self._place, axis=0)
+        return moved.reshape(-1, 3).take(self.node_at, axis=0)
 
     def _eliminate(self) -> None:
         """Follow the curve from the base to the tip and factorise the Hessian in its coordinates."""
@@ -175,7 +173,7 @@ class TrackedSolver(ChainSolver):
         nodes.take(order, axis=0, out=sweep.inputs[2].reshape(-1, 3), mode="clip")
         sweep()
         changed = sweep.outputs[1]
-        changed[self._strokes_at] -= strokes
+        changed[self.strokes_at] -= strokes
         gap, tilt = self.data.misfit(vertices, sweep.outputs[2].reshape(-1, 5))
         dual = nodal.take(order, axis=0).reshape(-1) @ self._moved[:, :-1]
         dual += forces[:, chain.actuated].reshape(-1) @ self._strokes[:, :-1]
