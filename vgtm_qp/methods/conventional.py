@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.linalg.lapack import dgbsv
 from scipy.sparse.csgraph import reverse_cuthill_mckee
@@ -88,7 +87,7 @@ class DenseSolution:
         self._layout, self._truss, self._method = layout, truss_of(layout.arm), method
         self._lengths = np.zeros((self._truss.member_count, layout.node_columns))
         self._fixed = self._truss.fixed
-        self._tip, self._present = _tip_columns(layout)
+        self._tip, self._present = layout.tip_columns
         self.rank: int | None = None
 
     def hold(self, members: Index, held: Mask) -> None:  # noqa: ARG002
@@ -124,7 +123,7 @@ class JointSolution:
     def __init__(self, layout: Layout, method: Method) -> None:
         self._method, self._levers = method, layout.arm.levers
         self._free = np.ones(len(self._levers), dtype=bool)
-        self._tip, self._present = _tip_columns(layout)
+        self._tip, self._present = layout.tip_columns
         self.rank: int | None = None
 
     def hold(self, members: Index, held: Mask) -> None:  # noqa: ARG002
@@ -156,7 +155,7 @@ class SparseSolution:
         truss = truss_of(layout.arm)
         scatter, members, actuators = truss.scatter, truss.member_count, np.arange(len(truss.actuators))
         self._flat, self._fixed = scatter.flat, truss.fixed
-        self._tip, self._present = _tip_columns(layout)
+        self._tip, self._present = layout.tip_columns
         tips = np.arange(len(layout.tip_rows))
         a = layout.node_columns
         y = a + len(actuators)
@@ -359,10 +358,3 @@ class ConventionalResolver(MethodResolver, serves="pseudoinverse"):
                 break
             q = self._displaced(q, self._solution.displacement(system, terms))
         raise SolverError("Newton's method on lengths and tip does not converge")
-
-
-def _tip_columns(layout: Layout) -> tuple[Index, NDArray[np.bool_]]:
-    """Return the columns of the tip's free nodes, and a mask of these in the tip's Jacobian."""
-    first = layout.node_column[layout.arm.end_effector.nodes]
-    present = np.repeat(first >= 0, 3)
-    return (first[:, None] + np.arange(3)).reshape(-1)[present], present

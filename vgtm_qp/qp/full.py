@@ -258,12 +258,10 @@ class FullBuilder:
     def _fixed_rows(self) -> list[_Rows]:
         """Return the rows before the clearances: the arm's motion, the tip, the curve's base, the gaps."""
         layout, arm, column = self.layout, self.layout.arm, self.column
-        pattern, tip, axis = arm.motion_pattern, np.arange(len(layout.tip_rows)), np.arange(3)
-        tip_columns = layout.node_column[arm.end_effector.nodes]
-        present = np.repeat(tip_columns >= 0, 3)
-        flat = (tip_columns[:, None] + axis).reshape(-1)[present]
+        pattern, tip = arm.motion_pattern, np.arange(len(layout.tip_rows))
+        columns, present = layout.tip_columns
         tip_entries = [
-            _Entries(*_grid(tip, flat), lambda numbers: numbers.tip_jacobian[:, present]),
+            _Entries(*_grid(tip, columns), lambda numbers: numbers.tip_jacobian[:, present]),
             _Entries(tip, np.full(len(tip), self.size - 1), lambda numbers: -numbers.tip_rate),
         ]
         if layout.elastic_tip:

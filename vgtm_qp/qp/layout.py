@@ -114,6 +114,13 @@ class Layout:
         column[self.arm.free] = 3 * np.arange(len(self.arm.free))
         return column
 
+    @cached_property
+    def tip_columns(self) -> tuple[Index, Mask]:
+        """(T,) columns of the displacements of the tip's free nodes, and (3 K,) mask of these in the tip's Jacobian."""
+        first = self.node_column[self.arm.end_effector.nodes]
+        present = np.repeat(first >= 0, 3)
+        return (first[:, None] + np.arange(3)).reshape(-1)[present], present
+
     @property
     def node_columns(self) -> int:
         """Number of node displacement coordinates, 3 (N - N_c)."""
