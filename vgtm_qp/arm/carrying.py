@@ -10,12 +10,10 @@ import numpy as np
 
 from vgtm_qp.arm.arm import Approach, Arm, between, tip_function
 from vgtm_qp.arrays import Array, Index
+from vgtm_qp.geometry.bodies import lengthened
 from vgtm_qp.geometry.shapes import Obstacle
 from vgtm_qp.problem.enclosing import box_capsules, capsule_along, enclosing_capsule
 from vgtm_qp.rotation import rotation_from_vector
-
-_LEAST_AXIS = 1e-3
-"""Least length of the axis of a capsule, over its radius."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,12 +61,7 @@ def carried(obstacle: Obstacle) -> Carried:
         found = [(ends @ turn + table.center, radius) for ends, radius in own]
     radius = np.array([radius for _, radius in found])
     ends = np.stack([ends[[0, -1]] for ends, _ in found])
-    # The axis of a ball has a direction, too; short ones grow along their own.
-    along = ends[:, 1] - ends[:, 0]
-    length = np.linalg.norm(along, axis=1, keepdims=True)
-    unit = np.where(length > 0.0, along / np.maximum(length, np.finfo(float).tiny), [0.0, 0.0, 1.0])
-    more = np.maximum(_LEAST_AXIS * radius[:, None] - length, 0.0) / 2.0
-    return Carried(obstacle, ends + np.array([[-1.0], [1.0]]) * (more * unit)[:, None], radius)
+    return Carried(obstacle, lengthened(ends, radius), radius)
 
 
 class Carrier:

@@ -18,6 +18,21 @@ _CAPSULE, _HULL = 2, 4
 _ROOM = 1e-6
 """Share of its size by which a simplex is larger than what it encloses."""
 
+_LEAST_AXIS = 1e-3
+"""Least length of the axis of a capsule, over its radius."""
+
+
+def lengthened(ends: Array, radius: Array) -> Array:
+    """Return the ends (C, 2, 3) of the axes of capsules of those radii (C,), m, far enough apart for a direction.
+
+    The axis of a ball is along z; short ones grow along their own.
+    """
+    along = ends[:, 1] - ends[:, 0]
+    length = np.linalg.norm(along, axis=1, keepdims=True)
+    unit = np.where(length > 0.0, along / np.maximum(length, np.finfo(float).tiny), [0.0, 0.0, 1.0])
+    more = np.maximum(_LEAST_AXIS * radius[:, None] - length, 0.0) / 2.0
+    return np.asarray(ends + np.array([[-1.0], [1.0]]) * (more * unit)[:, None])
+
 
 @dataclass(frozen=True, eq=False)
 class Hull:

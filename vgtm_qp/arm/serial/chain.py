@@ -11,15 +11,12 @@ import numpy as np
 
 from vgtm_qp.arm.symbols import rotated
 from vgtm_qp.arrays import Array, Index, Mask
-from vgtm_qp.geometry.bodies import Hull
+from vgtm_qp.geometry.bodies import Hull, lengthened
 from vgtm_qp.problem.arm import ArmBody, ArmTable
 from vgtm_qp.rotation import rotation_from_vector
 
 UNROLLED = 20
 """Number of joints up to which their functions are written out one after another: faster, but long in C."""
-
-_LEAST_AXIS = 1e-3
-"""Length of a ball's axis over its radius: an axis of length zero would have no direction."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -274,15 +271,7 @@ def hull_of(body: ArmBody) -> Hull | None:
 def vertices_of(body: ArmBody, hull: Hull | None) -> tuple[Array, Array]:
     """Return the points that span a body, and all of its vertices, m: the ends of its axis, or those of its hull."""
     if hull is None:
-        ends = ends_of(body)
+        axis = np.array(body.points, dtype=float)[None, [0, -1]]
+        (ends,) = lengthened(axis, np.array([body.radius]))
         return ends, ends
     return hull.simplex, np.array(body.points, dtype=float)
-
-
-def ends_of(body: ArmBody) -> Array:
-    """Return (2, 3) both ends of the axis of a body, m."""
-    ends = np.array(body.points, dtype=float)
-    least = _LEAST_AXIS * body.radius
-    if len(ends) == 2 and float(np.linalg.norm(ends[1] - ends[0])) >= least:
-        return ends
-    return np.asarray(ends.mean(axis=0) + 0.5 * least * np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]]))
