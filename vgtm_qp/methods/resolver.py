@@ -11,6 +11,7 @@ from vgtm_qp.arm.truss.arm import truss_of
 from vgtm_qp.arrays import Array
 from vgtm_qp.errors import CurveError, SolverError
 from vgtm_qp.problem import Problem
+from vgtm_qp.qp.answer import Closed
 from vgtm_qp.rotation import vector_from_rotation
 from vgtm_qp.rows.tip import TipGoal
 from vgtm_qp.step.actuation import Actuation
@@ -19,7 +20,6 @@ from vgtm_qp.step.build import build_arm
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.resolver import Resolver
 from vgtm_qp.step.setup import Setup
-from vgtm_qp.step.state import State, frozen
 from vgtm_qp.step.step import Step, StepStatus
 
 _COLLAPSED = 1e-3
@@ -60,22 +60,11 @@ class MethodResolver(Resolver, ABC):
             self._refuse_breakdown(nodes, path, start, end)
         except (SolverError, CurveError, np.linalg.LinAlgError) as error:
             return Step.stopped(self.state, f"step {self._steps}: {error}", 0)
-        kinematics, before = self.setup.kinematics, self.state
+        arm, kinematics = self.setup.arm, self.setup.kinematics
         kinematics.evaluate(moved.q)
-        quantities = frozen(kinematics.quantities)
-        time, late = before.after(dt)
-        self.state = State(
-            time=time,
-            late=late,
-            q=(q := frozen(moved.q)),
-            nodes=frozen(nodes),
-            control_vertices=frozen(moved.control_vertices),
-            torsion=frozen(moved.torsion),
-            quantities=quantities,
-            rates=frozen((quantities - before.quantities) / dt),
-            motion=frozen(q - before.q),
-            duration=dt,
-        )
+        tip = arm.end_effector.position(nodes), kinematics.tip_rotation.copy()
+        closed = Closed(moved.q, kinematics.quantities.copy(), 0.0, *tip)
+        self.state = self.state.next(arm, dt, closed, moved.control_vertices, moved.torsion)
         self._clock.add("kinematics")
         return Step(StepStatus.REACHED, 1.0, self.state, "", 0).over(whole, None)
 

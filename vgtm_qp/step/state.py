@@ -81,7 +81,13 @@ class State:
         return time, math.fsum((self.time, self.late, duration, -time))
 
     def next(
-        self, arm: Arm, duration: float, closed: Closed, vertices: Array, torsion: Array, shortfall: Shortfall
+        self,
+        arm: Arm,
+        duration: float,
+        closed: Closed,
+        vertices: Array,
+        torsion: Array,
+        shortfall: Shortfall | None = None,
     ) -> State:
         """Return the state of `arm` after a step of a `duration`, s; all arrays are read-only from now on."""
         (time, late), q, quantities = self.after(duration), _sealed(closed.q), _sealed(closed.quantities)
