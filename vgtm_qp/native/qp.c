@@ -94,7 +94,7 @@ typedef struct {
     double *started, *started_points, *started_torsions;   /* q and the curve before they were settled */
 
     /* Tolerances of quantities and equalities, greatest error at the start, and errors at which the iterations end. */
-    double member, tip, start, enough_length, enough_tip;
+    double member_error, tip_error, start, enough_length, enough_tip;
 
     double primal, dual, reached, furthest, off;
     int flag, iterations, held;
@@ -741,7 +741,7 @@ static int settle_all(Fused *f, int lets_go)
         advance(f, next, 0);
         is_measured = 0;
     }
-    return is_measured && (is_closed || f->errors[0] <= f->member) && f->off <= f->tip ? DONE : UNSETTLED;
+    return is_measured && (is_closed || f->errors[0] <= f->member_error) && f->off <= f->tip_error ? DONE : UNSETTLED;
 }
 
 /* The same, from where the answer led. */
@@ -753,7 +753,7 @@ EXPORT int settle(Fused *f)
     double slack = tip_slack(f);
     /* An elastic tip with a slack is not moved. */
     int code = slack > f->on_path ? UNSETTLED : settle_all(f, 0);
-    if (code != UNSETTLED || !(slack > f->tip)) return code;
+    if (code != UNSETTLED || !(slack > f->tip_error)) return code;
     memcpy(f->q, f->started, sizeof(double) * f->coordinates);
     memcpy(f->points, f->started_points, sizeof(double) * 3 * f->vertices);
     memcpy(f->torsions, f->started_torsions, sizeof(double) * f->torsion);

@@ -390,7 +390,7 @@ static int is_flawless(StepData *s)
         k += is_actuator;
     }
     /* An elastic tip with a slack need not be at its goal. */
-    int is_free = tip_slack(f) > f->tip;
+    int is_free = tip_slack(f) > f->tip_error;
     for (int i = 0; i < s->axes && !is_free; i++) {
         double error = f->condense.arg[8][s->axis[i]] + *f->gone * f->velocity[s->axis[i]];
         for (int k = 0; k < f->tip_nodes; k++) error -= s->tip_weight[k] * x[3 * f->tip_node[k] + s->axis[i]];

@@ -29,19 +29,7 @@ from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.linearise import StepInput
 from vgtm_qp.qp.numbers import UNBOUNDED, ClearanceRows
 from vgtm_qp.qp.residual import CONTRADICTION, TOLERANCE, InfeasibleStepError, refuse_large
-from vgtm_qp.qp.settle import (
-    AT_BOUND,
-    LEFT,
-    MOST_STEPS,
-    ON_PATH,
-    SETTLING_STEPS,
-    TOO_FAR,
-    WORST_CONDITION,
-    closing_function,
-    enough_length,
-    enough_tip_error,
-    missing_function,
-)
+from vgtm_qp.qp.settle import ON_PATH, SETTLING_STEPS, aims, closing_function, missing_function, tolerances
 from vgtm_qp.qp.shape import CurveRows
 from vgtm_qp.qp.stepper import NearRows
 from vgtm_qp.rows.tip import TipGoal
@@ -365,14 +353,8 @@ class FusedWorkspace:
     def aim(self, accuracy: Accuracy) -> None:
         """Settle to that `accuracy` from now on."""
         if accuracy is not self._accuracy:
-            home, self._accuracy = self._layout.arm.home_configuration, accuracy
-            self._program.set(
-                member=accuracy.member,
-                tip=accuracy.tip,
-                start=accuracy.start,
-                enough_length=enough_length(home, accuracy.member),
-                enough_tip=enough_tip_error(home, accuracy.tip),
-            )
+            self._accuracy = accuracy
+            self._program.set(**aims(self._layout.arm, accuracy))
 
     def displacement(self, x: Array) -> Array:
         """Return (N - N_c, 3) displacements of the free nodes by `x` and by residuals, m."""
@@ -548,6 +530,7 @@ def _numbers(layout: Layout) -> dict[str, Any]:
     place, of, share, by_nodes = _places(layout)
     return {
         **placement(layout),
+        **tolerances(arm),
         "nodes": nodes,
         "hard": len(layout.hard),
         "by_nodes": int(by_nodes),
@@ -556,15 +539,10 @@ def _numbers(layout: Layout) -> dict[str, Any]:
         "slacks": len(layout.slack_levers),
         "slack_pull": layout.slack_pull,
         "slack_weight": layout.slack_weights,
-        "at_bound": AT_BOUND * arm.fineness,
-        "left": LEFT * arm.fineness,
         "on_path": ON_PATH * arm.fineness,
         "levers": layout.levers,
         "lever": arm.unit,
-        "worst_condition": WORST_CONDITION,
         "settling_steps": SETTLING_STEPS,
-        "closing_steps": MOST_STEPS,
-        "too_far": TOO_FAR * arm.unit,
         "small_error": _SMALL_ERROR * arm.unit,
         "tiny_error": _TINY_ERROR * arm.unit,
         "feasibility": Daqp(arm.fineness).accuracy,

@@ -16,9 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve, solve_triangular
 
+from vgtm_qp.arm.arm import Arm
 from vgtm_qp.arm.symbols import Bound, Constants, goal_after
 from vgtm_qp.arrays import Array
-from vgtm_qp.qp.answer import StepSolution
+from vgtm_qp.qp.answer import Accuracy, StepSolution
 from vgtm_qp.qp.graph import StationSymbols, StepGraph
 from vgtm_qp.qp.layout import Layout
 
@@ -52,12 +53,35 @@ def enough_length(q: Array, tolerance: float) -> float:
     It is far below `tolerance`, because division by a short step's duration turns it into errors of rates and
     accelerations. For very long arms the rounding of node positions is the limit.
     """
-    return max(1e-3 * tolerance, 8.0 * _ROUNDING * float(np.abs(q).max()))
+    return max(_SETTLED * tolerance, 8.0 * _ROUNDING * float(np.abs(q).max()))
 
 
 def enough_tip_error(q: Array, tolerance: float) -> float:
     """Return the tip error, m or rad, at which settling stops; see :func:`enough_length`."""
     return max(_SETTLED * tolerance, 1e3 * _ROUNDING * float(np.abs(q).max()))
+
+
+def tolerances(arm: Arm) -> dict[str, float]:
+    """Return by field what C knows of settling; the fields of :func:`aims` come later."""
+    return {
+        "at_bound": AT_BOUND * arm.fineness,
+        "left": LEFT * arm.fineness,
+        "worst_condition": WORST_CONDITION,
+        "closing_steps": MOST_STEPS,
+        "too_far": TOO_FAR * arm.unit,
+    }
+
+
+def aims(arm: Arm, accuracy: Accuracy) -> dict[str, float]:
+    """Return by field to what accuracy C settles."""
+    home = arm.home_configuration
+    return {
+        "member_error": accuracy.member,
+        "tip_error": accuracy.tip,
+        "start": accuracy.start,
+        "enough_length": enough_length(home, accuracy.member),
+        "enough_tip": enough_tip_error(home, accuracy.tip),
+    }
 
 
 def held(displacement: Array, lower: Array, upper: Array, fineness: float) -> NDArray[np.bool_]:

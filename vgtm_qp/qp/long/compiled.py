@@ -23,15 +23,7 @@ from vgtm_qp.qp.long.solver import PRESSES, ChainSolver
 from vgtm_qp.qp.long.working_set import BLOCK, DEPENDENT, INDEPENDENT, NO_ROW
 from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.qp.residual import TOLERANCE
-from vgtm_qp.qp.settle import (
-    AT_BOUND,
-    LEFT,
-    MOST_STEPS,
-    TOO_FAR,
-    WORST_CONDITION,
-    enough_length,
-    enough_tip_error,
-)
+from vgtm_qp.qp.settle import aims, tolerances
 from vgtm_qp.qp.stepper import NearRows
 
 _ROOM, _NEAR, _SLOTS = 64, 64, 4
@@ -173,16 +165,9 @@ class CompiledChain:
 
     def aim(self, accuracy: Accuracy) -> None:
         """See :class:`~vgtm_qp.qp.stepper.Stepper`."""
-        if accuracy is self._accuracy:
-            return
-        home, self._accuracy = self.layout.arm.home_configuration, accuracy
-        self._program.set(
-            member_error=accuracy.member,
-            tip_error=accuracy.tip,
-            start=accuracy.start,
-            enough_length=enough_length(home, accuracy.member),
-            enough_tip=enough_tip_error(home, accuracy.tip),
-        )
+        if accuracy is not self._accuracy:
+            self._accuracy = accuracy
+            self._program.set(**aims(self.layout.arm, accuracy))
 
     def _load(self, asked: StepInput) -> None:
         """Write the state, the goal and the boxes."""
@@ -414,18 +399,13 @@ def _for_c(value: Any) -> Any:
 
 def _tolerances(layout: Layout) -> dict[str, Any]:
     """Return by field the tolerances of the dense QP and of settling; those of the accuracy come later."""
-    arm = layout.arm
     return {
+        **tolerances(layout.arm),
         "presses": PRESSES,
-        "accuracy": Daqp(arm.fineness).accuracy,
+        "accuracy": Daqp(layout.arm.fineness).accuracy,
         "no_row": NO_ROW,
         "dependent": DEPENDENT,
         "independent": INDEPENDENT,
-        "at_bound": AT_BOUND * arm.fineness,
-        "left": LEFT * arm.fineness,
-        "worst_condition": WORST_CONDITION,
-        "too_far": TOO_FAR * arm.unit,
-        "closing_steps": MOST_STEPS,
     }
 
 
