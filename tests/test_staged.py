@@ -15,9 +15,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from steps import MOVED_BASE
 
+from vgtm_qp.arm.truss import lengths
 from vgtm_qp.arm.truss.build import lock_members
 from vgtm_qp.arm.truss.kinematics import LengthRows
-from vgtm_qp.arm.truss.lengths import WIDEST, LengthSolver
 from vgtm_qp.errors import SolverError
 from vgtm_qp.problem.method import Weights
 from vgtm_qp.qp.condensed import CondensedSolver
@@ -408,13 +408,14 @@ def test_memory_is_linear_in_the_bays():
 @pytest.mark.parametrize("joint_offset", [0.0, 0.02])
 @pytest.mark.parametrize("is_wide", [False, True])
 @pytest.mark.parametrize("name", [*MODULES, "graph"])
-def test_lengths_by_a_band_and_by_a_sparse_matrix(name, is_wide, joint_offset, rng):
+def test_lengths_by_a_band_and_by_a_sparse_matrix(name, is_wide, joint_offset, rng, monkeypatch):
+    monkeypatch.setattr(lengths, "WIDEST", 0 if is_wide else lengths.WIDEST)
     truss = mast() if name == "graph" else MODULES[name](joint_offset=joint_offset)
     case = Case(truss, vertices=0)
     kinematics = case.kinematics
     kinematics.evaluate(random_pose(truss, rng, 0.02))
     error = rng.normal(size=truss.member_count)
-    solver = LengthSolver(case.layout.arm.bays, widest=0 if is_wide else WIDEST)
+    solver = lengths.LengthSolver(case.layout.arm.bays)
     step = solver.solve(kinematics.gradient, error)
     np.testing.assert_allclose(kinematics.motion().jacobian() @ step.ravel(), error, atol=1e-10)
     for wrong in (0.0, np.nan, np.inf):

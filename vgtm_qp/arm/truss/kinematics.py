@@ -19,7 +19,7 @@ from vgtm_qp.rows.members import end_function, member_end, member_function
 _DENSE = 150
 """Greatest number of node coordinates for which dense LAPACK is faster than a sparse factorisation."""
 
-_SINGULAR = "the length Jacobian is singular: the truss is in a singular pose"
+SINGULAR = "the length Jacobian is singular: the truss is in a singular pose"
 
 
 def length_gradients(truss: Truss, X: Array) -> Array:
@@ -116,7 +116,7 @@ def solved(jacobian: Any, known: Array) -> Array:
         else:
             answer = np.asarray(splu(jacobian.tocsc()).solve(known), dtype=float)
     except (np.linalg.LinAlgError, RuntimeError) as reason:
-        raise SolverError(_SINGULAR) from reason
+        raise SolverError(SINGULAR) from reason
     if not np.isfinite(answer).all():
-        raise SolverError(_SINGULAR)
+        raise SolverError(SINGULAR)
     return answer

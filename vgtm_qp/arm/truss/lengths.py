@@ -5,16 +5,14 @@ from __future__ import annotations
 import numpy as np
 from scipy import sparse
 from scipy.linalg.lapack import dgbsv
-from scipy.sparse.linalg import splu
 
 from vgtm_qp.arm.arm import Bays
+from vgtm_qp.arm.truss.kinematics import SINGULAR, solved
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.errors import SolverError
 
 WIDEST = 200
 """Number of diagonals from which on sparse LU is faster than banded LU."""
-
-_SINGULAR = "the length Jacobian is singular: the truss is in a singular pose"
 
 
 class LengthSolver:
@@ -29,8 +27,6 @@ class LengthSolver:
         Members whose lengths are given; all by default.
     stations : (K, 3) int, (K, 3), optional
         Nodes and weights of stations whose displacements are given too.
-    widest : int, optional
-        Number of diagonals from which on the LU is sparse, not banded.
     """
 
     def __init__(
@@ -38,8 +34,6 @@ class LengthSolver:
         bays: Bays,
         members: Index | None = None,
         stations: tuple[Index, Array] | None = None,
-        *,
-        widest: int = WIDEST,
     ) -> None:
         scatter, size = bays.scatter, bays.scatter.shape[1]
         members = np.arange(bays.member_count) if members is None else members
@@ -65,7 +59,7 @@ class LengthSolver:
         self._width, self._size = 2 * self._below + self._above + 1, size
         self._entry = columns * self._width + self._below + self._above + rows - columns
         self._places = rows, columns
-        self._is_wide = self._below + self._above >= widest
+        self._is_wide = self._below + self._above >= WIDEST
 
     def solve(self, gradient: Array, error: Array) -> Array:
         """Return displacements of the free nodes (N - N_c, 3), m.
@@ -84,15 +78,12 @@ class LengthSolver:
         """
         values = np.concatenate([gradient.reshape(-1)[self._flat], self._weights])
         size, known = self._size, error[self._order]
+        if not np.isfinite(values).all():
+            raise SolverError(SINGULAR)
         if self._is_wide:
-            try:
-                step = splu(sparse.csc_matrix((values, self._places), shape=(size, size))).solve(known)
-            except RuntimeError as reason:
-                raise SolverError(_SINGULAR) from reason
-            failed = 0
-        else:
-            band = np.bincount(self._entry, values, self._width * size).reshape(size, self._width).T
-            step, failed = dgbsv(self._below, self._above, band, known, overwrite_ab=1, overwrite_b=1)[2:]
-        if failed or not (np.isfinite(values).all() and np.isfinite(step).all()):
-            raise SolverError(_SINGULAR)
+            return solved(sparse.csc_matrix((values, self._places), shape=(size, size)), known).reshape(-1, 3)
+        band = np.bincount(self._entry, values, self._width * size).reshape(size, self._width).T
+        step, failed = dgbsv(self._below, self._above, band, known, overwrite_ab=1, overwrite_b=1)[2:]
+        if failed or not np.isfinite(step).all():
+            raise SolverError(SINGULAR)
         return np.asarray(step).reshape(-1, 3)
