@@ -18,12 +18,11 @@ from vgtm_qp.study.scenes import random_scene
 
 
 @pytest.mark.parametrize("name", TRUSSES)
-def test_ends_and_their_jacobians_are_those_of_the_formulas(name, rng):
+def test_the_jacobians_of_ends_are_those_of_the_formulas(name, rng):
     truss = TRUSSES[name](joint_offset=0.1)
     X = random_pose(truss, rng)
-    kinematics = EndKinematics(truss.members, truss.joints, compiled=False)
+    kinematics = EndKinematics(truss.members, truss.joints)
     kinematics.evaluate(X)
-    np.testing.assert_allclose(kinematics.ends, truss.member_ends(X), atol=1e-14)
     wanted = central_differences(truss.member_ends, X)
     found = np.zeros_like(wanted)
     for member, end, corner in np.ndindex(*kinematics.nodes.shape):

@@ -44,27 +44,24 @@ def place_function(truss: Truss) -> Bound:
 
 
 class EndKinematics:
-    """The ends r_ik of members in offset joints and their Jacobians, at one configuration.
+    """The Jacobians of the ends r_ik of members in offset joints, at one configuration.
 
     Attributes
     ----------
     nodes : (M, 2, 3) int
         The triangle that places each end, its own node first.
-    ends : (M, 2, 3)
-        m; overwritten by `evaluate`, like `jacobian`.
     jacobian : (M, 2, 3, 9)
-        d end / d (positions of ``nodes``).
+        d end / d (positions of ``nodes``); overwritten by `evaluate`.
     """
 
-    def __init__(self, members: Index, joints: Joints, *, compiled: bool = True) -> None:
+    def __init__(self, members: Index, joints: Joints) -> None:
         self.nodes = joints.triangle[members]
-        self._kernel = Kernel(end_function().map(2 * len(members)), compiled=compiled)
+        self._kernel = Kernel(end_function().map(2 * len(members)))
         self._kernel.inputs[1][:] = joints.offset.reshape(-1)
-        self.ends = self._kernel.outputs[0].reshape(-1, 2, 3)
         self.jacobian = self._kernel.outputs[1].reshape(-1, 2, 9, 3).transpose(0, 1, 3, 2)
 
     def evaluate(self, X: Array) -> None:
-        """Overwrite ends and their Jacobians with those at node positions `X` (N, 3), m."""
+        """Overwrite the Jacobians with those at node positions `X` (N, 3), m."""
         self._kernel.inputs[0][:] = X[self.nodes].reshape(-1)
         self._kernel()
 
