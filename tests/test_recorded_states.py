@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from recorded_states import CASES, Recording, differences, load, record
+from recorded_states import CASES, PROBLEMS, Recording, differences, load, record
 
 from vgtm_qp.compiled import compiler
 
@@ -19,6 +19,10 @@ WRONG_WITHOUT_A_COMPILER = {
 @pytest.fixture(scope="module")
 def recorded() -> dict[str, Recording]:
     return load()
+
+
+def test_each_bundled_problem_is_a_case():
+    assert {f"bundled {path.stem}" for path in PROBLEMS.glob("*.toml")} <= set(CASES)
 
 
 def test_each_case_is_on_record(recorded):
