@@ -20,7 +20,7 @@ from vgtm_qp.bench import BaselineName, contestants, measure, report, scenes
 from vgtm_qp.bench.chart import plot_phases
 from vgtm_qp.bench.contestants import BASELINES, BarePseudoinverse, make_baseline
 from vgtm_qp.bench.fresh import measure_fresh, measure_start
-from vgtm_qp.bench.measure import Pairs, Spent, breakdown, run_alone, run_in_turn, timing
+from vgtm_qp.bench.measure import Pairs, StepTime, breakdown, run_alone, run_in_turn, timing
 from vgtm_qp.bench.tables import render
 from vgtm_qp.bench.tour import Goal, Tour, make_goals
 from vgtm_qp.cli import main
@@ -117,7 +117,7 @@ def walk_to(resolver: vq.Resolver, goals: list[Goal], count: int) -> None:
 
 @pytest.mark.smoke
 def test_percentiles_are_of_the_clock_and_of_the_processor_apart() -> None:
-    found = timing([Spent(k, 201.0 - k) for k in range(1, 102)])
+    found = timing([StepTime(k, 201.0 - k) for k in range(1, 102)])
     assert (found["median"], found["cpu"], found["steps"]) == (51.0, 150.0, 101)
     assert (found["p95"], found["p99"], found["max"]) == (96.0, 100.0, 101.0)
     assert (found["cpu_p95"], found["cpu_p99"], found["cpu_max"]) == (195.0, 199.0, 200.0)
@@ -177,12 +177,12 @@ def test_goals_are_those_of_the_maneuver_as_a_control_loop_asks_for_them() -> No
 
 @pytest.mark.smoke
 def test_phases_sum_to_the_total_and_an_interrupted_step_does_not_decide() -> None:
-    spent = [Spent(1.0, 1.0)] * 10 + [Spent(1000.0, 1.0)] * 30
+    spent = [StepTime(1.0, 1.0)] * 10 + [StepTime(1000.0, 1.0)] * 30
     found = breakdown(spent, {"qp": [0.5] * 10 + [999.0] * 30, "distance": [0.25] * 40})
     assert found["total"] == 1.0
     assert found["phases"] == {"qp": 0.5, "distance": 0.25, "other": 0.25}
-    assert breakdown([Spent(3.0, 3.0)], {"qp": [1.0]})["phases"] == {"qp": 1.0, "other": 2.0}
-    rare = breakdown([Spent(1.0, 1.0)] * 19 + [Spent(9.0, 9.0)], {"qp": [0.5] * 20})
+    assert breakdown([StepTime(3.0, 3.0)], {"qp": [1.0]})["phases"] == {"qp": 1.0, "other": 2.0}
+    rare = breakdown([StepTime(1.0, 1.0)] * 19 + [StepTime(9.0, 9.0)], {"qp": [0.5] * 20})
     assert rare == {"total": 1.0, "phases": {"qp": 0.5, "other": 0.5}}
 
 
@@ -271,7 +271,7 @@ def test_runs_in_turn_take_the_same_steps_from_the_same_states_and_drift_cancels
 
 
 def test_a_ratio_is_of_the_processor_and_steps_without_answer_are_counted_apart(free: vq.Problem) -> None:
-    pairs = Pairs([Spent(9.0, 4.0)] * 3, [Spent(1.0, 2.0)] * 3)
+    pairs = Pairs([StepTime(9.0, 4.0)] * 3, [StepTime(1.0, 2.0)] * 3)
     assert pairs.ratio == 2.0
 
     class Failing(Watched):

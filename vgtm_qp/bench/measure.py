@@ -44,14 +44,14 @@ _OVERRUN = 5.0
 """A run ends after this many times its duration, however few steps it had."""
 
 
-class Spent(NamedTuple):
+class StepTime(NamedTuple):
     """Wall-clock time, and CPU time of the thread, of a step, s."""
 
     wall: float
     cpu: float
 
 
-def timing(spent: Sequence[Spent]) -> dict[str, float]:
+def timing(spent: Sequence[StepTime]) -> dict[str, float]:
     """Return seconds of one or more steps, and their number ``steps``.
 
     ``median``, ``p95``, ``p99`` and ``max`` are by the clock; ``cpu``, ``cpu_p95``, ``cpu_p99`` and ``cpu_max`` the
@@ -63,7 +63,7 @@ def timing(spent: Sequence[Spent]) -> dict[str, float]:
     return found | {"steps": len(spent)}
 
 
-def breakdown(spent: Sequence[Spent], phases: Mapping[str, ArrayLike]) -> dict[str, Any]:
+def breakdown(spent: Sequence[StepTime], phases: Mapping[str, ArrayLike]) -> dict[str, Any]:
     """Return where the time of S steps goes: mean seconds in each of the ``phases`` (S,), which sum to the ``total``.
 
     Of the steps that the system did not interrupt, by clock and CPU time, the mean is that of the middle half in the
@@ -87,7 +87,7 @@ class Steps:
     first, empty if nothing did.
     """
 
-    spent: list[Spent] = field(default_factory=list)
+    spent: list[StepTime] = field(default_factory=list)
     phases: dict[str, list[float]] = field(default_factory=dict)
     qps: list[int] = field(default_factory=list)
     fcl_rows: list[int] = field(default_factory=list)
@@ -100,8 +100,8 @@ class Steps:
 class Pairs:
     """Times of a baseline and of the resolver over the same steps; `failed` counts steps without answer."""
 
-    theirs: list[Spent] = field(default_factory=list)
-    ours: list[Spent] = field(default_factory=list)
+    theirs: list[StepTime] = field(default_factory=list)
+    ours: list[StepTime] = field(default_factory=list)
     failed: int = 0
 
     @property
@@ -109,7 +109,7 @@ class Pairs:
         """Median CPU time of the baseline over that of the resolver."""
         return timing(self.theirs)["cpu"] / timing(self.ours)["cpu"]
 
-    def add(self, baseline: Contestant, block: list[tuple[State, Goal, Spent]]) -> None:
+    def add(self, baseline: Contestant, block: list[tuple[State, Goal, StepTime]]) -> None:
         """Let the baseline take steps that the resolver took, from the states where they began."""
         for state, goal, ours in block:
             theirs, answered = _take(baseline, state, goal)
@@ -132,7 +132,7 @@ class _Walk:
         self._resolver.state = self._resolver.setup.home_state()
         self.tour.restart()
 
-    def step(self) -> tuple[Spent, Step]:
+    def step(self) -> tuple[StepTime, Step]:
         """Take a step; return its time, and the step."""
         take, goal = self._resolver.step, self.tour.goal
         spent, step = _timed(lambda: take(position=goal.pose.position, pointing=goal.pointing))
@@ -186,7 +186,7 @@ def run_in_turn(
     walk, found = _Walk(resolver, goals), Pairs()
     _take(baseline, resolver.state, walk.tour.goal)
     finish_compiling()
-    block: list[tuple[State, Goal, Spent]] = []
+    block: list[tuple[State, Goal, StepTime]] = []
     for count in walk.repeat(seconds, steps):
         state, goal = resolver.state, walk.tour.goal
         ours, _ = walk.step()
@@ -199,7 +199,7 @@ def run_in_turn(
     return found
 
 
-def _take(contestant: Contestant, state: State, goal: Goal) -> tuple[Spent, bool]:
+def _take(contestant: Contestant, state: State, goal: Goal) -> tuple[StepTime, bool]:
     """Let a baseline take a step from a state; return its time and whether it found an answer."""
     contestant.place(state)
 
@@ -212,7 +212,7 @@ def _take(contestant: Contestant, state: State, goal: Goal) -> tuple[Spent, bool
     return _timed(answers)
 
 
-def _timed(take: Callable[[], _Answer]) -> tuple[Spent, _Answer]:
+def _timed(take: Callable[[], _Answer]) -> tuple[StepTime, _Answer]:
     wall, cpu = perf_counter(), thread_time()
     answer = take()
-    return Spent(perf_counter() - wall, thread_time() - cpu), answer
+    return StepTime(perf_counter() - wall, thread_time() - cpu), answer

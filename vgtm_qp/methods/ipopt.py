@@ -18,7 +18,7 @@ from vgtm_qp.errors import SolverError
 from vgtm_qp.methods.resolver import MethodResolver, Moved
 from vgtm_qp.problem import Problem
 from vgtm_qp.rows.tip import TipGoal, axes, turned_axes
-from vgtm_qp.step.actuation import Box, within
+from vgtm_qp.step.actuation import Bounds, within
 from vgtm_qp.step.build import build_arm
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.separation import Separation
@@ -125,7 +125,7 @@ class NonlinearProgram:
     def answer(
         self,
         start: Array,
-        box: Box,
+        box: Bounds,
         goal: TipGoal,
         rows: Array,
         floors: Array,
@@ -261,7 +261,7 @@ class NonlinearResolver(MethodResolver):
                 return Moved(q, state.control_vertices, state.torsion)
         raise SolverError(f"the clearances do not hold after {_ROUNDS} programs")
 
-    def _box(self, state: State, dt: float) -> Box:
+    def _box(self, state: State, dt: float) -> Bounds:
         """Return the box of the actuators after a step, for a share of it within a trust region."""
         arm, box = self.setup.arm, self._actuation.box(state, dt)
         if self._share == 1.0:

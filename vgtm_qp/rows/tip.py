@@ -10,7 +10,7 @@ import casadi as ca
 from vgtm_qp.arrays import Array
 from vgtm_qp.errors import GoalError, nearest
 
-Pair = tuple[Any, Any]
+PositionRotation = tuple[Any, Any]
 """A position and a rotation, or their rates."""
 
 _ROWS = {
@@ -193,9 +193,9 @@ def levers(rows: Sequence[str], unit_length: float) -> list[float]:
 
 def along_path(
     rows: Sequence[str],
-    tip: Pair,
-    goal: Pair,
-    rates: Pair,
+    tip: PositionRotation,
+    goal: PositionRotation,
+    rates: PositionRotation,
     motion: Any,
     levers: Any,
     unit: Any,

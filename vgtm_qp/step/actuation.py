@@ -15,7 +15,7 @@ from vgtm_qp.rows.limits import actuator_box, binding, resting_box
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import State
 
-Box = tuple[Array, Array]
+Bounds = tuple[Array, Array]
 """Least and greatest values (n_a,) of the actuators after a step."""
 
 _LEAST_APPROACH = 2e-3
@@ -30,7 +30,7 @@ _INSTANT = 1e-9
 """Times that differ by less are the same, s."""
 
 
-def within(box: Box, values: Array, trust: Array) -> Box:
+def within(box: Bounds, values: Array, trust: Array) -> Bounds:
     """Return the part of a box that is no further than `trust` from the values (n_a,), or else its nearest sides."""
     lower, upper = box
     return (
@@ -151,7 +151,7 @@ class Actuation:
         left = self._jams[-1][1] - time if self._jams else np.inf
         return left / dt if left < dt - _INSTANT else 1.0
 
-    def box(self, state: State, dt: float) -> Box:
+    def box(self, state: State, dt: float) -> Bounds:
         """Return the least and greatest values of the actuators after a step of `dt`, s, from `state`."""
         limits = self.limits(state, dt)
         return limits.lower, limits.upper
@@ -170,7 +170,7 @@ class Actuation:
             lower, upper = actuator_box(value, state.rates.take(self._actuators), *limits)
         return Limits(lower, upper, self.names, value, travel, stroke, self._acceleration, self._held)
 
-    def creeping(self, state: State, box: Box, dt: float) -> Box | None:
+    def creeping(self, state: State, box: Bounds, dt: float) -> Bounds | None:
         """Return the part of a box from which every actuator can stop at once; None if there is none."""
         value, reach = self.values(state), (1.0 - 1e-9) * self._acceleration * dt * dt
         lower, upper = np.maximum(box[0], value - reach), np.minimum(box[1], value + reach)
@@ -180,7 +180,7 @@ class Actuation:
         self._stroke = stroke
         self._resting.inputs[1][:], self._resting.inputs[2][:] = stroke[:, 0], stroke[:, 1]
 
-    def _resting_box(self, value: Array, travel: Array, approach: Array | float) -> Box:
+    def _resting_box(self, value: Array, travel: Array, approach: Array | float) -> Bounds:
         inputs = self._resting.inputs
         inputs[0][:], inputs[3][:], inputs[4][:] = value, travel, approach
         self._resting()

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vgtm_qp.step.actuation import Actuation, Box
+from vgtm_qp.step.actuation import Actuation, Bounds
 from vgtm_qp.step.attempt import Attempt
 from vgtm_qp.step.closing import Closing
 from vgtm_qp.step.path import Path
@@ -125,7 +125,7 @@ class Brakes:
         base = self.shaping.setup.base_motion
         return -np.inf if base is None else base.end - _INSTANT
 
-    def _done(self, state: State, path: Path, start: float, end: float, box: Box, progress: float) -> Step:
+    def _done(self, state: State, path: Path, start: float, end: float, box: Bounds, progress: float) -> Step:
         """Return the attempt at a piece of path of which the tip has already covered `progress`."""
         target = self.shaping.target(state, self.dt, path, start, end, box)
         return self.attempt.run(state, target, progress=progress, enough=0.0)
@@ -138,7 +138,7 @@ class Brakes:
         """
         covered = 0.5 * piece
 
-        def step(now: State, limits: Box) -> tuple[State, float] | None:
+        def step(now: State, limits: Bounds) -> tuple[State, float] | None:
             nonlocal covered, value
             gentler = [(value, min(value + share * covered, path.end), 0.0) for share in _GENTLER]
             for start, end, behind in [(min(value + piece, path.end), value, 1.0), *gentler]:
@@ -162,7 +162,7 @@ class Brakes:
         line = Path(np.array([0.0, 1.0]), np.stack([here, there]), np.stack([rotation] * 2))
         number = 0
 
-        def step(now: State, limits: Box) -> tuple[State, float] | None:
+        def step(now: State, limits: Bounds) -> tuple[State, float] | None:
             nonlocal number
             start, end = (1.0 - max(1.0 - k / count, 0.0) ** 2 for k in (number, number + 1))
             number += 1
@@ -178,14 +178,14 @@ class Brakes:
             return None
         closing = Closing(setup.layout, setup.kinematics)
 
-        def step(now: State, limits: Box) -> tuple[State, float] | None:
+        def step(now: State, limits: Bounds) -> tuple[State, float] | None:
             then = self._released(now, limits, closing)
             return None if then is None else (then, value)
 
         return self._follow(state, step, self._until_the_base_rests())
 
     def _follow(
-        self, state: State, step: Callable[[State, Box], tuple[State, float] | None], until: float
+        self, state: State, step: Callable[[State, Bounds], tuple[State, float] | None], until: float
     ) -> Steps | None:
         """Return the steps until a time, s, and until the arm can stay; None if one fails or too many."""
         found: Steps = []
@@ -205,7 +205,7 @@ class Brakes:
             state = done[0]
         return None
 
-    def _count(self, state: State, limits: Box) -> int:
+    def _count(self, state: State, limits: Bounds) -> int:
         """Return the number of steps that the fastest actuator needs by itself.
 
         Each step reduces its speed by half the width of its box.
@@ -216,7 +216,7 @@ class Brakes:
         width = np.maximum(0.5 * (upper - lower), 1e-12)
         return int(np.ceil(min(float((speed / width).max(initial=0.0)), float(_MOST_STEPS))))
 
-    def _released(self, state: State, limits: Box, closing: Closing) -> State | None:
+    def _released(self, state: State, limits: Bounds, closing: Closing) -> State | None:
         """Return the state after the least allowed motion of every actuator; None if it is not clear."""
         setup, attempt = self.shaping.setup, self.attempt
         arm, base, separation = setup.arm, setup.base_motion, attempt.separation

@@ -22,7 +22,7 @@ from vgtm_qp.step.checks import checked_arm
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.remedies import Remedy, relaxed
 from vgtm_qp.step.resolver import Resolver
-from vgtm_qp.step.scene import Near
+from vgtm_qp.step.scene import NamedShortfall
 from vgtm_qp.step.separation import Separation
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.shaping import Shaping
@@ -199,7 +199,7 @@ class QPResolver(Resolver, serves="qp"):
             stop = explain(self.setup, self._separation, state, goal, limits, last)
             return struck(stop, self.setup, self._separation, state, dt)
 
-    def _after_change(self) -> Near:
+    def _after_change(self) -> NamedShortfall:
         """See :class:`ChangingScene`; braking steps stay as they were, since the arm cannot stop sooner.
 
         Pairs that come too near while the arm brakes are too near as well.

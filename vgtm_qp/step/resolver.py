@@ -19,7 +19,7 @@ from vgtm_qp.step.actuation import Actuation
 from vgtm_qp.step.attempt import Phases
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.remedies import Remedy
-from vgtm_qp.step.scene import ChangingScene, Near
+from vgtm_qp.step.scene import ChangingScene, NamedShortfall
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import Shortfall, State
 from vgtm_qp.step.step import Step
@@ -299,7 +299,7 @@ class Resolver(ChangingScene):
             return Stop(StopKind.NONLINEAR)
         return Stop(StopKind.NONLINEAR, dict.fromkeys(last.blocked_by, 0.0), reason=last.reason)
 
-    def _after_change(self) -> Near:
+    def _after_change(self) -> NamedShortfall:
         """See :class:`ChangingScene`; a method without rows drives no pair apart, but tells."""
         setup, state = self.setup, self.state
         near = setup.monitor.near(

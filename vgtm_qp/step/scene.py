@@ -24,7 +24,7 @@ from vgtm_qp.step.build import make_obstacle
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import State
 
-Near = dict[str, float]
+NamedShortfall = dict[str, float]
 """Pairs that are below their clearance, or will be while the arm brakes, by name, with their distances, m."""
 
 
@@ -57,7 +57,7 @@ class ChangingScene(ABC):
         """Return position (3,), m, and rotation (3, 3) of the end effector."""
 
     @abstractmethod
-    def _after_change(self) -> Near:
+    def _after_change(self) -> NamedShortfall:
         """Take note that the scene has changed; return the pairs that are too near now."""
 
     @property
@@ -83,7 +83,7 @@ class ChangingScene(ABC):
         """Number of changes of the scene so far."""
         return self._changes
 
-    def add_obstacle(self, obstacle: Box | Sphere | Cylinder | Mesh) -> Near:
+    def add_obstacle(self, obstacle: Box | Sphere | Cylinder | Mesh) -> NamedShortfall:
         """Put an obstacle into the scene, its `center` where it is now; return the pairs that are too near now.
 
         Raises
@@ -103,7 +103,7 @@ class ChangingScene(ABC):
         center: ArrayLike | None = None,
         rotation_vector: ArrayLike | None = None,
         velocity: ArrayLike | None = None,
-    ) -> Near:
+    ) -> NamedShortfall:
         """Put an obstacle elsewhere, or let it move otherwise; return the pairs that are too near now.
 
         Parameters
@@ -146,7 +146,7 @@ class ChangingScene(ABC):
             del there[self._number(name)]
             self._put(there)
 
-    def attach(self, body: Box | Sphere | Cylinder | Mesh | str) -> Near:
+    def attach(self, body: Box | Sphere | Cylinder | Mesh | str) -> NamedShortfall:
         """Carry a body at the tip from now on; return the pairs that are too near now.
 
         The body keeps its present place relative to the end effector. Steps and their proofs keep it clear of obstacles
@@ -183,7 +183,7 @@ class ChangingScene(ABC):
             held = carried(_placed(made, rotation.T @ (self._center(made.table) - position), turn))
             return self._put(there, [*self.setup.carrier.carried, held])
 
-    def release(self, name: str, *, keep: bool = True) -> Near:
+    def release(self, name: str, *, keep: bool = True) -> NamedShortfall:
         """Let go of a body that is carried; return the pairs that are too near now.
 
         It rests where it is as an obstacle, which the arm then leaves like any that is too near, or is gone if it is
@@ -204,7 +204,7 @@ class ChangingScene(ABC):
                 there.append(self._at_rest(held[k]))
             return self._put(there, [*held[:k], *held[k + 1 :]])
 
-    def set_clearance(self, *, safe: float | None = None, self_safe: float | None = None) -> Near:
+    def set_clearance(self, *, safe: float | None = None, self_safe: float | None = None) -> NamedShortfall:
         """Change the least clearances that are kept; return the pairs that are too near now.
 
         Parameters
@@ -235,7 +235,9 @@ class ChangingScene(ABC):
             raise GoalError(f"there is no obstacle {name!r}; {_known(name, names)}")
         return names.index(name)
 
-    def _named(self, found: Iterable[tuple[Pair, float]], known: Near | None = None) -> Near:
+    def _named(
+        self, found: Iterable[tuple[Pair, float]], known: NamedShortfall | None = None
+    ) -> NamedShortfall:
         """Return the least distance of each name: of pairs that are `found`, and of those that are `known`."""
         names, near = self.setup.monitor.names, dict(known or {})
         for pair, distance in found:
@@ -266,7 +268,7 @@ class ChangingScene(ABC):
         except ProblemError as error:
             raise GoalError("; ".join(map(str, error.mistakes))) from None
 
-    def _put(self, obstacles: Sequence[Obstacle], carried: Sequence[Carried] | None = None) -> Near:
+    def _put(self, obstacles: Sequence[Obstacle], carried: Sequence[Carried] | None = None) -> NamedShortfall:
         self.setup.put(obstacles, carried)
         self._changes += 1
         return self._after_change()

@@ -14,7 +14,7 @@ from vgtm_qp.curve.families import CurveFamily
 from vgtm_qp.curve.redundancy import Refit, add_control_vertices, remove_control_vertices
 from vgtm_qp.errors import GoalError
 from vgtm_qp.qp.layout import Layout
-from vgtm_qp.step.actuation import Box
+from vgtm_qp.step.actuation import Bounds
 from vgtm_qp.step.build import elastic_engine, make_engine
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.setup import Setup
@@ -37,7 +37,7 @@ class Shaping:
         self._places = setup.vertex_goals
         self._built: dict[tuple[object, ...], Setup] = {}
 
-    def target(self, state: State, dt: float, path: Path, start: float, end: float, box: Box) -> Target:
+    def target(self, state: State, dt: float, path: Path, start: float, end: float, box: Bounds) -> Target:
         """Return the target of a step of `dt`, s, from `state` over the values `start` to `end` of a path."""
         then, _ = state.after(dt)
         return record(
