@@ -20,7 +20,7 @@ from vgtm_qp.bench import BaselineName, contestants, measure, report, scenes
 from vgtm_qp.bench.chart import plot_phases
 from vgtm_qp.bench.contestants import BASELINES, BarePseudoinverse, make_baseline
 from vgtm_qp.bench.fresh import measure_fresh, measure_start
-from vgtm_qp.bench.measure import Pairs, StepTime, breakdown, run_alone, run_in_turn, timing
+from vgtm_qp.bench.measure import PairedTimes, StepTime, breakdown, run_alone, run_in_turn, timing
 from vgtm_qp.bench.tables import render
 from vgtm_qp.bench.tour import Goal, Tour, make_goals
 from vgtm_qp.cli import main
@@ -271,7 +271,7 @@ def test_runs_in_turn_take_the_same_steps_from_the_same_states_and_drift_cancels
 
 
 def test_a_ratio_is_of_the_processor_and_steps_without_answer_are_counted_apart(free: vq.Problem) -> None:
-    pairs = Pairs([StepTime(9.0, 4.0)] * 3, [StepTime(1.0, 2.0)] * 3)
+    pairs = PairedTimes([StepTime(9.0, 4.0)] * 3, [StepTime(1.0, 2.0)] * 3)
     assert pairs.ratio == 2.0
 
     class Failing(Watched):

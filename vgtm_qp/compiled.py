@@ -41,11 +41,9 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from vgtm_qp.arrays import Array
 from vgtm_qp.errors import EvaluationError
-
-Array = NDArray[np.float64]
 
 _LOG = logging.getLogger(__name__)
 

@@ -97,7 +97,7 @@ class Steps:
 
 
 @dataclass
-class Pairs:
+class PairedTimes:
     """Times of a baseline and of the resolver over the same steps; `failed` counts steps without answer."""
 
     theirs: list[StepTime] = field(default_factory=list)
@@ -181,9 +181,9 @@ def run_alone(resolver: Resolver, goals: list[Goal], *, seconds: float, steps: i
 
 def run_in_turn(
     resolver: Resolver, baseline: Contestant, goals: list[Goal], *, seconds: float, steps: int
-) -> Pairs:
+) -> PairedTimes:
     """Return the times of baseline and resolver over the same steps, by blocks in turn, a resolver's last."""
-    walk, found = _Walk(resolver, goals), Pairs()
+    walk, found = _Walk(resolver, goals), PairedTimes()
     _take(baseline, resolver.state, walk.tour.goal)
     finish_compiling()
     block: list[tuple[State, Goal, StepTime]] = []

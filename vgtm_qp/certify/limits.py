@@ -10,11 +10,13 @@ from numpy.typing import NDArray
 
 from vgtm_qp.arrays import Array
 from vgtm_qp.certify.verdict import Finding
-from vgtm_qp.verify.arm import Arm
+from vgtm_qp.verify.arm import AnyRecordedArm
 from vgtm_qp.verify.check import INSTANT, LIMIT_TOLERANCE, MEMBER_TOLERANCE, changes, locks_of
 
 
-def beyond_limits(arm: Arm, problem: Mapping[str, Any], time: Array, values: Array) -> Iterator[Finding]:
+def beyond_limits(
+    arm: AnyRecordedArm, problem: Mapping[str, Any], time: Array, values: Array
+) -> Iterator[Finding]:
     """Yield what is wrong with the values (T, M) of the arm's quantities at times (T,), s.
 
     Rates and accelerations are those of ``verify``: the mean over a step, and the change of the rate from
@@ -38,7 +40,7 @@ def beyond_limits(arm: Arm, problem: Mapping[str, Any], time: Array, values: Arr
     yield from _moved(arm, locks, time, values)
 
 
-def _out_of_range(arm: Arm, time: Array, values: Array) -> Iterator[Finding]:
+def _out_of_range(arm: AnyRecordedArm, time: Array, values: Array) -> Iterator[Finding]:
     for bound, side in ((arm.stroke[:, 0], -1.0), (arm.stroke[:, 1], 1.0)):
         excess = side * (values - bound)
         for k, run in _runs(arm.actuated & (excess > LIMIT_TOLERANCE)):
@@ -56,7 +58,9 @@ def _crossing(time: Array, excess: Array, row: int, step: int) -> float:
     return float(time[row] + share * (time[other] - time[row]))
 
 
-def _moved(arm: Arm, locks: list[tuple[int, float]], time: Array, values: Array) -> Iterator[Finding]:
+def _moved(
+    arm: AnyRecordedArm, locks: list[tuple[int, float]], time: Array, values: Array
+) -> Iterator[Finding]:
     """Yield locked quantities that move, and those locked from the start that are not at home."""
     # Quantities without an actuator are locked from the start.
     kept = [(k, -np.inf, float(arm.home_quantities[k])) for k in np.flatnonzero(~arm.actuated).tolist()]

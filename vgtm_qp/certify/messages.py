@@ -9,14 +9,14 @@ from typing import Any
 from vgtm_qp.errors import MissingExtraError, ProblemError
 from vgtm_qp.problem.table import shown
 
-Points = list[tuple[str, float, Sequence[Any]]]
+MessagePoints = list[tuple[str, float, Sequence[Any]]]
 """Of each point the place in words, the time, s, and the positions of the joints, rad or m."""
 
 _TRAJECTORY, _STATE = "JointTrajectory", "JointState"
 _GREATEST_BYTES = 500_000_000
 
 
-def read_bag(file: Path) -> tuple[list[str], Points]:
+def read_bag(file: Path) -> tuple[list[str], MessagePoints]:
     """Return joint names and points of the one JointTrajectory in an MCAP file, or else of its JointState messages.
 
     Raises
@@ -49,7 +49,7 @@ def read_bag(file: Path) -> tuple[list[str], Points]:
         raise ProblemError.at(file, "file", several, "one JointTrajectory message")
     if found[_TRAJECTORY]:
         topic, message = found[_TRAJECTORY][0]
-        points: Points = [
+        points: MessagePoints = [
             (f"{topic}, point {k}", _seconds(point.time_from_start), list(point.positions))
             for k, point in enumerate(message.points)
         ]
@@ -59,13 +59,13 @@ def read_bag(file: Path) -> tuple[list[str], Points]:
     return _states(file, found[_STATE])
 
 
-def _states(file: Path, messages: list[tuple[str, Any]]) -> tuple[list[str], Points]:
+def _states(file: Path, messages: list[tuple[str, Any]]) -> tuple[list[str], MessagePoints]:
     """Return names and points of JointState messages of one topic, all of the same joints; times are from the first."""
     topics = sorted({topic for topic, _ in messages})
     if len(topics) > 1:
         raise ProblemError.at(file, "file", f"JointState messages on {', '.join(topics)}", "one topic")
     names, begin = list(messages[0][1].name), _seconds(messages[0][1].header.stamp)
-    points: Points = []
+    points: MessagePoints = []
     for k, (topic, message) in enumerate(messages):
         if list(message.name) != names:
             found = shown(", ".join(message.name))
@@ -77,7 +77,7 @@ def _states(file: Path, messages: list[tuple[str, Any]]) -> tuple[list[str], Poi
     return names, points
 
 
-def read_message(file: Path) -> tuple[list[str], Points]:
+def read_message(file: Path) -> tuple[list[str], MessagePoints]:
     """Return joint names and points of a JointTrajectory as YAML, the form of ``ros2 topic pub``.
 
     Raises
@@ -105,7 +105,7 @@ def read_message(file: Path) -> tuple[list[str], Points]:
     entries = _entry(file, data, "points", "message")
     if not all(isinstance(name, str) for name in names):
         raise ProblemError.at(file, "joint_names", shown(names), "a list of names")
-    points: Points = []
+    points: MessagePoints = []
     for k, point in enumerate(entries):
         place = f"points[{k}]"
         start = point.get("time_from_start") if isinstance(point, Mapping) else None

@@ -12,7 +12,7 @@ from vgtm_qp.arrays import Array, Index
 from vgtm_qp.certify.verdict import Finding
 from vgtm_qp.result.chain import RecordedChain
 from vgtm_qp.result.poses import base_poses
-from vgtm_qp.verify.arm import Arm
+from vgtm_qp.verify.arm import AnyRecordedArm
 from vgtm_qp.verify.clearance import RecordedMotion
 
 
@@ -29,7 +29,7 @@ class GivenMotion(RecordedMotion):
 
     bends: Array
 
-    def __init__(self, arm: Arm, time: Array, states: Array) -> None:
+    def __init__(self, arm: AnyRecordedArm, time: Array, states: Array) -> None:
         super().__init__(arm, time, states)
         steps = 64.0 + 16.0 * len(arm.quantity_names)
         self.rounding = steps * float(np.finfo(float).eps) * self.furthest

@@ -12,7 +12,7 @@ from vgtm_qp.arrays import Array, Index
 from vgtm_qp.certify.motion import GivenMotion
 from vgtm_qp.verify.clearance import AgainstMembers, Pairs, box_gap
 from vgtm_qp.verify.convex import of_each
-from vgtm_qp.verify.distance import Separation
+from vgtm_qp.verify.distance import DistanceAndNormal
 from vgtm_qp.verify.obstacles import Body
 
 _CHUNK = 1_000_000
@@ -61,7 +61,7 @@ class Kept(ABC):
         """
 
     @abstractmethod
-    def separation(self, points: Array, pair: Pairs, near: Array | None = None) -> Separation:
+    def separation(self, points: Array, pair: Pairs, near: Array | None = None) -> DistanceAndNormal:
         """Return distances from surface to surface (P,), m, and normals (P, 3), those of hulls searched `near` some."""
 
     @abstractmethod
@@ -186,7 +186,7 @@ class KeptBodies(Kept):
         own = np.einsum("pec,pcd->ped", ends(pair[0]) - center[:, None], self._rotation[pair[1]])
         return np.concatenate([own, own], axis=1)
 
-    def separation(self, points: Array, pair: Pairs, near: Array | None = None) -> Separation:
+    def separation(self, points: Array, pair: Pairs, near: Array | None = None) -> DistanceAndNormal:
         """See ``Kept``; normals are in the pieces' own frames."""
         shape, sizes = self._shape, self._sizes[pair[1]]
         distance, normal = of_each(
@@ -250,7 +250,7 @@ class KeptMembers(Kept):
         """See ``Kept``: the ends of both."""
         return self._against.points(pair, ends, time)
 
-    def separation(self, points: Array, pair: Pairs, near: Array | None = None) -> Separation:
+    def separation(self, points: Array, pair: Pairs, near: Array | None = None) -> DistanceAndNormal:
         """See ``Kept``."""
         return self._against.separation(points, pair, near)
 

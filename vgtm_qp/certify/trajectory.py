@@ -18,7 +18,7 @@ from vgtm_qp.errors import Mistake, ProblemError, nearest
 from vgtm_qp.problem.fields import GREATEST_LENGTH, quoted
 from vgtm_qp.problem.table import shown
 from vgtm_qp.problem.timed_rows import GREATEST_MISTAKES, NUMBER, read_timed_rows, time_mistakes
-from vgtm_qp.verify.arm import Arm
+from vgtm_qp.verify.arm import AnyRecordedArm
 from vgtm_qp.verify.check import locks_of
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ class Columns:
     needed: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, arm: Arm, problem: Problem) -> Columns:
+    def of(cls, arm: AnyRecordedArm, problem: Problem) -> Columns:
         """Return the columns of an arm's trajectories."""
         given = arm.actuated.copy()
         given[arm.followers[:, 0]] = True

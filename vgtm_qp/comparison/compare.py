@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from vgtm_qp.comparison.row import INTERRUPTED, Row, make_row
+from vgtm_qp.comparison.row import INTERRUPTED, MethodRow, make_row
 from vgtm_qp.comparison.tables import markdown_table
 from vgtm_qp.errors import ProblemError, VgtmError
 from vgtm_qp.machine import machine, sentence
@@ -22,7 +22,7 @@ from vgtm_qp.step.step import Step
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Progress = Callable[[str, float, Step], None]
+MethodProgress = Callable[[str, float, Step], None]
 
 _NUMBERS = {
     "tip error [m]": ("tip_error", 1.0, ".1e"),
@@ -34,7 +34,7 @@ _NUMBERS = {
     "travel [m]": ("actuator_travel", 1.0, ".2f"),
     "step [ms]": ("step_time", 1e3, ".2f"),
 }
-"""Columns of the table: the attribute of :class:`Row`, its factor, and its format."""
+"""Columns of the table: the attribute of :class:`MethodRow`, its factor, and its format."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -43,14 +43,14 @@ class Report:
 
     Attributes
     ----------
-    rows : tuple of Row
+    rows : tuple of MethodRow
     maneuvers : dict
         The maneuvers by (problem, method); a method that was refused is missing.
     machine : dict
         Machine and versions of the times.
     """
 
-    rows: tuple[Row, ...]
+    rows: tuple[MethodRow, ...]
     maneuvers: dict[tuple[str, str], Maneuver]
     machine: dict[str, str]
 
@@ -66,7 +66,7 @@ class Report:
         """True if an interrupt ended the comparison; methods that were not run have rows that say so."""
         return any(row.status == INTERRUPTED for row in self.rows)
 
-    def row(self, method: str) -> Row:
+    def row(self, method: str) -> MethodRow:
         """Return the first row of a method."""
         return next(row for row in self.rows if row.method == method)
 
@@ -101,7 +101,7 @@ def compare(
     problem: Problem,
     *,
     methods: Sequence[str] = DEFAULT_METHODS,
-    progress: Progress | None = None,
+    progress: MethodProgress | None = None,
 ) -> Report:
     """Solve a problem by each method, verify each maneuver, and return the report.
 
@@ -124,7 +124,7 @@ def compare(
     """
     check_is_problem(problem)
     check_methods(methods)
-    found: dict[str, tuple[Row, Maneuver | None]] = {}
+    found: dict[str, tuple[MethodRow, Maneuver | None]] = {}
     try:
         for name in methods:
             with suppress(VgtmError):
@@ -140,14 +140,16 @@ def compare(
     return Report(tuple(found[name][0] for name in methods), maneuvers, machine())
 
 
-def missing_row(problem: Problem, name: str) -> Row:
+def missing_row(problem: Problem, name: str) -> MethodRow:
     """Return the row of a method that was not run because of an interrupt."""
-    return Row(problem.name, name, False, False, INTERRUPTED, 0.0, 0, "interrupted before its first step")
+    return MethodRow(
+        problem.name, name, False, False, INTERRUPTED, 0.0, 0, "interrupted before its first step"
+    )
 
 
 def run_method(
-    problem: Problem, name: str, *, progress: Progress | None = None
-) -> tuple[Row, Maneuver | None]:
+    problem: Problem, name: str, *, progress: MethodProgress | None = None
+) -> tuple[MethodRow, Maneuver | None]:
     """Return the row of one method, and the maneuver unless the method was refused."""
     try:
         changed = with_method(problem, name)
@@ -157,14 +159,14 @@ def run_method(
     except VgtmError as error:
         # The report names the problem already, and has no room for the path of its file.
         reason = str(error.mistakes[0] if isinstance(error, ProblemError) else error).splitlines()[0]
-        return Row(problem.name, name, False, False, "refused", 0.0, 0, reason), None
+        return MethodRow(problem.name, name, False, False, "refused", 0.0, 0, reason), None
     row = make_row(problem.name, name, maneuver)
     if INTERRUPTED in maneuver.blocked_by:
         row = replace(row, status=INTERRUPTED)
     return row, maneuver
 
 
-def _cells(row: Row) -> list[str]:
+def _cells(row: MethodRow) -> list[str]:
     found = [(getattr(row, key), factor, form) for key, factor, form in _NUMBERS.values()]
     return [
         row.method,

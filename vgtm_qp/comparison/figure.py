@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from vgtm_qp.arrays import Array
-from vgtm_qp.comparison.row import Row
+from vgtm_qp.comparison.row import MethodRow
 from vgtm_qp.maneuver.maneuver import Maneuver
 from vgtm_qp.view.figure import FOOT, MARGIN, View, panels_from
 from vgtm_qp.view.style import BOUND_COLOUR, COLOURS, DARK, DASHES, FORBIDDEN, MARKS, RC, WIDTH
@@ -31,7 +31,7 @@ _VERDICTS = {"solved": "#006B4F", "keeps all but drifts": "#9A6700", "failed": B
 class _Block(NamedTuple):
     """The panels of one problem: its rows, their maneuvers, the view, and the words above each panel with colours."""
 
-    rows: list[Row]
+    rows: list[MethodRow]
     maneuvers: list[Maneuver | None]
     view: View | None
     size: Array
@@ -49,7 +49,7 @@ class _Block(NamedTuple):
         return -(-len(self.rows) // self.columns) * (float(self.size[1]) + self.title + 0.16)
 
 
-def plot_comparison(rows: Sequence[Row], maneuvers: Mapping[tuple[str, str], Maneuver]) -> Figure:
+def plot_comparison(rows: Sequence[MethodRow], maneuvers: Mapping[tuple[str, str], Maneuver]) -> Figure:
     """Return the figure: one panel a maneuver with its last state, as in frames; below, clearance and drift."""
     problems = list(dict.fromkeys(row.problem for row in rows))
     blocks = []
@@ -71,7 +71,7 @@ def plot_comparison(rows: Sequence[Row], maneuvers: Mapping[tuple[str, str], Man
     return figure
 
 
-def _block(rows: list[Row], maneuvers: list[Maneuver | None], named: bool) -> _Block:
+def _block(rows: list[MethodRow], maneuvers: list[Maneuver | None], named: bool) -> _Block:
     columns = min(_COLUMNS, max(len(rows), 3))
     found = [maneuver for maneuver in maneuvers if maneuver is not None]
     view = _view(found) if found else None
@@ -91,7 +91,7 @@ def _view(maneuvers: list[Maneuver]) -> View:
     return View(first, [0], others=points[near])
 
 
-def _words(row: Row, letters: int, named: bool) -> list[tuple[str, Any]]:
+def _words(row: MethodRow, letters: int, named: bool) -> list[tuple[str, Any]]:
     """Return the lines above a panel with their colours: the method, its verdict, and what is wrong."""
     verdict = "solved" if row.solved else "keeps all but drifts" if row.kept else "failed"
     text = " ".join(row.reason.split())
@@ -122,7 +122,7 @@ def _draw_block(figure: Figure, block: _Block, top: float) -> None:
         block.view.of(maneuver).draw(axes, last, block.size, ruler=at_left, labels=labels)
 
 
-def _draw_curves(figure: Figure, problems: list[str], pairs: list[tuple[Row, Maneuver | None]]) -> None:
+def _draw_curves(figure: Figure, problems: list[str], pairs: list[tuple[MethodRow, Maneuver | None]]) -> None:
     """Draw clearance and drift along the path: a colour and a mark a method, a dash a problem."""
     width, high = _AXES
     total = float(figure.get_figheight())

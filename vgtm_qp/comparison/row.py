@@ -13,7 +13,7 @@ _DRIFT = 1e-3
 
 
 @dataclass(frozen=True)
-class Row:
+class MethodRow:
     """One method on one problem. Lengths in m, times in s; None if there was nothing to measure.
 
     Attributes
@@ -59,7 +59,7 @@ class Row:
     rank: int | None = None
 
 
-def make_row(problem: str, method: str, maneuver: Maneuver) -> Row:
+def make_row(problem: str, method: str, maneuver: Maneuver) -> MethodRow:
     """Return the row of a verified maneuver."""
     certificate = maneuver.certificate
     assert certificate is not None, "a maneuver is verified before it is compared"
@@ -70,7 +70,7 @@ def make_row(problem: str, method: str, maneuver: Maneuver) -> Row:
     others = [line for line in failures if not line.startswith(("member error", "tip error"))]
     travel = np.abs(np.diff(maneuver.actuator_values, axis=0)).sum()
     reason = next(iter([*others, *failures]), "") if done else maneuver.stopped_by
-    return Row(
+    return MethodRow(
         problem=problem,
         method=method,
         solved=maneuver.status == "solved",

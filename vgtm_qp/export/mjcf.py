@@ -13,7 +13,7 @@ from vgtm_qp.errors import ExportError
 from vgtm_qp.result.chain import RecordedChain
 from vgtm_qp.result.result import Result
 from vgtm_qp.rotation import quaternion
-from vgtm_qp.verify.arm import Arm, RecordedArm, arm_of
+from vgtm_qp.verify.arm import AnyRecordedArm, RecordedArm, arm_of
 from vgtm_qp.view.drawing import (
     FIXED_COLOUR,
     OBSTACLE_COLOUR,
@@ -24,7 +24,7 @@ from vgtm_qp.view.drawing import (
     stroke_colours,
 )
 
-Element = ElementTree.Element
+XmlElement = ElementTree.Element
 
 MASS_PER_LENGTH = 1.0
 """Mass of a member, kg/m of its home length, half of it at each end."""
@@ -72,7 +72,7 @@ def mjcf(maneuver: Result) -> str:
     """
     arm = modelled_arm(maneuver)
     name = str(maneuver.manifest["problem"].get("name", "arm"))
-    root = Element("mujoco", model=name)
+    root = XmlElement("mujoco", model=name)
     _add(root, "compiler", angle="radian", autolimits="true", boundmass=_LEAST_MASS, boundinertia=_LEAST_MASS)
     _add(root, "option", timestep=TIME_STEP, integrator="implicitfast", gravity=(0.0, 0.0, -9.81))
     drawing = drawing_of_maneuver(maneuver)
@@ -93,7 +93,7 @@ def mjcf(maneuver: Result) -> str:
     return ElementTree.tostring(root, encoding="unicode") + "\n"
 
 
-def _add_view(root: Element, maneuver: Result, drawing: Drawing) -> Element:
+def _add_view(root: XmlElement, maneuver: Result, drawing: Drawing) -> XmlElement:
     """Add camera and light, with which a viewer opens: the arm in all states, its tip and obstacles are in the picture.
 
     Return the element of the assets, with a bright sky.
@@ -118,7 +118,7 @@ def _add_view(root: Element, maneuver: Result, drawing: Drawing) -> Element:
     return asset
 
 
-def modelled_arm(maneuver: Result) -> Arm:
+def modelled_arm(maneuver: Result) -> AnyRecordedArm:
     """Return the arm of a maneuver; ExportError if a MuJoCo model would differ from it or from its scene."""
     arm = arm_of(maneuver)
     if maneuver.manifest.get("scenes"):
@@ -134,7 +134,7 @@ def node_masses(arm: RecordedArm) -> Array:
     return np.bincount(arm.members.reshape(-1), np.repeat(half, 2), minlength=len(arm.home)).astype(float)
 
 
-def _add_nodes(world: Element, arm: RecordedArm) -> None:
+def _add_nodes(world: XmlElement, arm: RecordedArm) -> None:
     masses, radius = node_masses(arm), max(float(np.median(arm.radius)), _THINNEST)
     for k, name in enumerate(arm.node_names):
         body = _add(world, "body", name=name, pos=arm.home[k])
@@ -151,7 +151,7 @@ def _add_nodes(world: Element, arm: RecordedArm) -> None:
 
 
 def _add_joints(
-    asset: Element, world: Element, arm: RecordedChain, table: Sequence[Mapping[str, Any]]
+    asset: XmlElement, world: XmlElement, arm: RecordedChain, table: Sequence[Mapping[str, Any]]
 ) -> None:
     """Add the joints of a serial arm, each a body in the one before, with the links that move with them.
 
@@ -208,7 +208,7 @@ def _carried(arm: RecordedChain, link: int) -> tuple[int, Array]:
     return common[-1], np.array([known[0][common[-1]], known[1][common[-1]]])
 
 
-def _add_drives(root: Element, arm: RecordedChain) -> None:
+def _add_drives(root: XmlElement, arm: RecordedChain) -> None:
     equalities, actuators = (_add(root, kind) for kind in ("equality", "actuator"))
     pairs = zip(arm.followers.tolist(), arm.multipliers.tolist(), strict=True)
     followed = {joint: (other, multiplier) for (joint, other), multiplier in pairs}
@@ -227,7 +227,7 @@ def _add_drives(root: Element, arm: RecordedChain) -> None:
 
 
 def _add_obstacle(
-    asset: Element, world: Element, mesh: ObstacleMesh, table: Mapping[str, Any], time: float
+    asset: XmlElement, world: XmlElement, mesh: ObstacleMesh, table: Mapping[str, Any], time: float
 ) -> None:
     """Add an obstacle by its ``[[obstacle]]`` table, at its place at `time`, s."""
     name, shape = f"obstacle {mesh.name}", str(table["shape"])
@@ -251,7 +251,7 @@ def _add_obstacle(
         geom.set("axisangle", _text((*(turn / angle), angle)))
 
 
-def _add_members(root: Element, arm: RecordedArm) -> None:
+def _add_members(root: XmlElement, arm: RecordedArm) -> None:
     tendons, equalities, actuators = (_add(root, kind) for kind in ("tendon", "equality", "actuator"))
     for k, member in enumerate(arm.member_names):
         colour = stroke_colours(np.array(0.5)) if arm.actuated[k] else np.array(FIXED_COLOUR)
@@ -267,7 +267,9 @@ def _add_members(root: Element, arm: RecordedArm) -> None:
             _add(actuators, "position", name=member, tendon=member, **drive)
 
 
-def _add_keyframes(root: Element, maneuver: Result, arm: Arm, moving: Sequence[ObstacleMesh]) -> None:
+def _add_keyframes(
+    root: XmlElement, maneuver: Result, arm: AnyRecordedArm, moving: Sequence[ObstacleMesh]
+) -> None:
     keyframes, given = _add(root, "keyframe"), _GivenPoses.of(maneuver, arm, moving)
     values = maneuver.joints if maneuver.joints is not None else (maneuver.nodes - arm.home)[:, arm.free]
     for k, (time, controls) in enumerate(zip(maneuver.time, maneuver.actuator_values, strict=True)):
@@ -284,7 +286,7 @@ class _GivenPoses(NamedTuple):
     quaternion: Array
 
     @classmethod
-    def of(cls, maneuver: Result, arm: Arm, moving: Sequence[ObstacleMesh]) -> _GivenPoses:
+    def of(cls, maneuver: Result, arm: AnyRecordedArm, moving: Sequence[ObstacleMesh]) -> _GivenPoses:
         """Return the poses at a maneuver's states; a truss has base nodes, which do not turn, as its base."""
         time, base = maneuver.time, maneuver.nodes[:, np.sort(arm.base)]
         paths = np.array([[mesh.position(float(t)) for mesh in moving] for t in time])
@@ -295,7 +297,7 @@ class _GivenPoses(NamedTuple):
         return cls(position, turns)
 
 
-def _add(parent: Element, tag: str, **attributes: object) -> Element:
+def _add(parent: XmlElement, tag: str, **attributes: object) -> XmlElement:
     return ElementTree.SubElement(parent, tag, {key: _text(value) for key, value in attributes.items()})
 
 

@@ -16,11 +16,11 @@ from vgtm_qp.problem.fields import (
     Direction,
     Distance,
     File,
-    Limit,
-    Mass,
+    Kilograms,
     Name,
     Number,
     Onset,
+    UpperLimit,
     Vector,
     count,
     exactly,
@@ -69,10 +69,14 @@ class Joint(Table, called="a joint"):
         default=None, description="least and greatest joint value, rad or m"
     )
     home: Number = Field(default=0.0, description="joint value of the home pose, rad or m")
-    rate: Limit | None = Field(default=None, description="greatest speed, rad/s or m/s")
-    acceleration: Limit | None = Field(default=None, description="greatest acceleration, rad/s^2 or m/s^2")
-    effort: Limit | None = Field(default=None, description="greatest torque, N m, or force, N, of its drive")
-    mass: Mass = Field(default=0.0, description="of what it moves up to the next joint, kg")
+    rate: UpperLimit | None = Field(default=None, description="greatest speed, rad/s or m/s")
+    acceleration: UpperLimit | None = Field(
+        default=None, description="greatest acceleration, rad/s^2 or m/s^2"
+    )
+    effort: UpperLimit | None = Field(
+        default=None, description="greatest torque, N m, or force, N, of its drive"
+    )
+    mass: Kilograms = Field(default=0.0, description="of what it moves up to the next joint, kg")
     center_of_mass: Vector = Field(
         default=ORIGIN, description="where that has its centre, in its own frame, m"
     )

@@ -214,8 +214,8 @@ Distance = Annotated[float, Within("a distance in metres, 0 or more", ge=0, le=G
 Angle = Annotated[
     float, Within("an angle in radians, 0 or more and less than a right angle (1.5708)", ge=0, lt=math.pi / 2)
 ]
-Limit = Annotated[float, Within("a limit greater than 0; leave the key out for no limit", gt=0, le=1e9)]
-Mass = Annotated[float, Within("a mass in kilograms, 0 or more", ge=0, le=1e9)]
+UpperLimit = Annotated[float, Within("a limit greater than 0; leave the key out for no limit", gt=0, le=1e9)]
+Kilograms = Annotated[float, Within("a mass in kilograms, 0 or more", ge=0, le=1e9)]
 Seconds = Annotated[float, Within("a time in seconds, greater than 0", ge=LEAST_LENGTH, le=1e9)]
 Onset = Annotated[float, Within("a time in seconds, 0 or more", ge=0, le=1e9)]
 Weight = Annotated[float, Within("a weight, 0 or more", ge=0, le=1e12)]

@@ -21,7 +21,7 @@ from vgtm_qp.problem.fields import (
 from vgtm_qp.problem.table import Place, Table, increasing
 
 Coordinates = Literal["position", "pointing", "orientation", "x", "y", "z"]
-Steps = Annotated[int, count(1, 1_000_000)]
+StepCount = Annotated[int, count(1, 1_000_000)]
 
 
 class EndEffector(Table, called="an end effector"):
@@ -72,7 +72,7 @@ class WaypointManeuver(Table, called="a maneuver through waypoints"):
     """From the home pose through waypoints, in equal steps of time."""
 
     kind: Literal["path"] = "path"
-    steps: Steps = Field(default=50, description="number of steps")
+    steps: StepCount = Field(default=50, description="number of steps")
     waypoint: tuple[Waypoint, ...] = Field(min_length=1, description="the waypoints, in the order of time")
 
     def _contradictions(self) -> Iterator[tuple[Place, str]]:
@@ -115,7 +115,7 @@ def _pick(value: Any) -> type[Table] | None:
     return PathManeuver if has_path else WaypointManeuver
 
 
-Maneuver = Annotated[
+ManeuverTable = Annotated[
     WaypointManeuver | PathManeuver,
     ByKey("kind", _pick, later=("goal", "deployment", "follow-the-leader", "shape")),
 ]

@@ -80,7 +80,7 @@ class Mesh(_Obstacle, called="a mesh"):
     scale: Factor = Field(default=1.0, description="factor that brings the file's unit to metres")
 
 
-Obstacle = Annotated[Box | Sphere | Cylinder | Mesh, ByKey("shape", in_file=True, kind="obstacle")]
+ObstacleTable = Annotated[Box | Sphere | Cylinder | Mesh, ByKey("shape", in_file=True, kind="obstacle")]
 
 
 def _with_own_shapes(
@@ -118,7 +118,7 @@ def _with_own_shapes(
     return obstacles  # type: ignore[no-any-return]
 
 
-Obstacles = Annotated[tuple[Obstacle, ...], WrapValidator(_with_own_shapes)]
+Obstacles = Annotated[tuple[ObstacleTable, ...], WrapValidator(_with_own_shapes)]
 
 
 class _Around(Table, called="a scene"):

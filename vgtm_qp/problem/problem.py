@@ -14,12 +14,12 @@ from vgtm_qp.notebook import html_table
 from vgtm_qp.parts import Kind, find_part
 from vgtm_qp.problem.arm import FROM_URDF, OF_URDF, ArmTable
 from vgtm_qp.problem.fields import Name, expect, quoted
-from vgtm_qp.problem.goal import EndEffector, Maneuver, Waypoint, WaypointManeuver
+from vgtm_qp.problem.goal import EndEffector, ManeuverTable, Waypoint, WaypointManeuver
 from vgtm_qp.problem.method import Method
 from vgtm_qp.problem.obstacle import ClearanceTable, Obstacles
-from vgtm_qp.problem.shape import BezierCurve, Curve, SegmentCurve
+from vgtm_qp.problem.shape import BezierCurve, CurveTable, SegmentCurve
 from vgtm_qp.problem.table import Place, Table, key_path, shown, unique, value_at
-from vgtm_qp.problem.truss import GraphTruss, Truss
+from vgtm_qp.problem.truss import GraphTruss, TrussTable
 
 SCHEMA_VERSION = 1
 
@@ -48,15 +48,15 @@ class Problem(Table, called="a problem"):
         expect(f"{SCHEMA_VERSION}, the version of the problem file that this release reads"),
     ] = Field(default=SCHEMA_VERSION, description="version of the form of this file")
     name: Name = Field(default="unnamed", description="title in tables and figures")
-    truss: Truss | None = Field(default=None, description="the arm: a truss")
+    truss: TrussTable | None = Field(default=None, description="the arm: a truss")
     arm: ArmTable | None = Field(default=None, description="a serial arm, in the place of a truss")
-    curve: Curve = Field(
+    curve: CurveTable = Field(
         default_factory=BezierCurve, description="the reference curve; a Bezier of 6 vertices where absent"
     )
     end_effector: EndEffector = Field(
         default_factory=EndEffector, description="which coordinates are steered"
     )
-    maneuver: Maneuver = Field(description="where the end effector goes")
+    maneuver: ManeuverTable = Field(description="where the end effector goes")
     obstacle: Obstacles = Field(default=(), description="what the arm keeps away from")
     clearance: ClearanceTable = Field(default_factory=ClearanceTable, description="how far it keeps away")
     method: Method = Field(default_factory=Method, description="how each step is solved")
@@ -69,7 +69,7 @@ class Problem(Table, called="a problem"):
         return self._source
 
     @property
-    def arm_table(self) -> Truss | ArmTable:
+    def arm_table(self) -> TrussTable | ArmTable:
         """The table that describes the arm; `thickness` is the place of what makes its bodies thick."""
         table = self.truss or self.arm
         assert table is not None

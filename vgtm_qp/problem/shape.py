@@ -137,7 +137,7 @@ def _from_own_family(
     return curve
 
 
-Curve = Annotated[
+CurveTable = Annotated[
     BezierCurve | BSplineCurve | BetaSplineCurve | SegmentCurve,
     ByKey("family", kind="curve"),
     WrapValidator(_from_own_family),

@@ -15,11 +15,9 @@ _GREATEST_BYTES = 200_000_000
 GREATEST_MISTAKES = 100
 NUMBER = f"a finite number between -{GREATEST_LENGTH:g} and {GREATEST_LENGTH:g}"
 
-Mistakes = list[Mistake]
-
 
 def read_timed_rows(
-    file: Path, read_header: Callable[[list[str], Mistakes], list[str]]
+    file: Path, read_header: Callable[[list[str], list[Mistake]], list[str]]
 ) -> tuple[list[str], list[dict[str, float]]]:
     """Return the keys of the columns, and the numbers of each row by key; the times ``t`` increase, from 0 or later.
 
@@ -36,7 +34,7 @@ def read_timed_rows(
         The file is missing, is not text, or has wrong columns or cells: each is named by line and column.
     """
     header, rows = _rows(file)
-    mistakes: Mistakes = []
+    mistakes: list[Mistake] = []
     header, values = read_header(header, mistakes), list[dict[str, float]]()
     if not mistakes:
         before = -math.inf
@@ -53,7 +51,7 @@ def read_timed_rows(
     return header, values
 
 
-def time_mistakes(place: str, time: float, before: float) -> Mistakes:
+def time_mistakes(place: str, time: float, before: float) -> list[Mistake]:
     """Return the mistakes of a row's time after the time `before`, s, -inf for the first row; NaN passes."""
     step = time - max(before, 0.0)
     if time < 0:
@@ -65,7 +63,7 @@ def time_mistakes(place: str, time: float, before: float) -> Mistakes:
     return []
 
 
-def check_columns(header: list[str], known: tuple[str, ...], expected: str, mistakes: Mistakes) -> None:
+def check_columns(header: list[str], known: tuple[str, ...], expected: str, mistakes: list[Mistake]) -> None:
     """Add columns that are not `known`, or stand twice, to the mistakes."""
     for column, name in enumerate(header, start=1):
         if name not in known:

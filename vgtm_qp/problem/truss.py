@@ -24,11 +24,11 @@ from vgtm_qp.problem.fields import (
     Distance,
     Flag,
     Length,
-    Limit,
     Name,
     Onset,
     Seconds,
     Stroke,
+    UpperLimit,
     Vector,
     count,
     exactly,
@@ -91,10 +91,10 @@ class BasePose(Table, called="a base pose"):
 class _Truss(Table):
     thickness: ClassVar[Place] = ("truss", "member_radius")
 
-    rate: Limit | None = Field(
+    rate: UpperLimit | None = Field(
         default=None, description="greatest |d length / dt| of an actuated member, m/s"
     )
-    acceleration: Limit | None = Field(
+    acceleration: UpperLimit | None = Field(
         default=None, description="greatest |d2 length / dt2| of an actuated member, m/s^2"
     )
     member_radius: Distance = Field(default=0.03, description="radius of every member, a capsule, m")
@@ -216,8 +216,8 @@ class Member(Table, called="a member"):
         default=None, description="home length, m; as the node positions give it where absent"
     )
     stroke: Stroke | None = Field(default=None, description="least and greatest length, m")
-    rate: Limit | None = Field(default=None, description="greatest |d length / dt|, m/s")
-    acceleration: Limit | None = Field(default=None, description="greatest |d2 length / dt2|, m/s^2")
+    rate: UpperLimit | None = Field(default=None, description="greatest |d length / dt|, m/s")
+    acceleration: UpperLimit | None = Field(default=None, description="greatest |d2 length / dt2|, m/s^2")
     radius: Distance | None = Field(
         default=None, description="radius, m; the truss's member_radius where absent"
     )
@@ -343,7 +343,7 @@ def _from_own_module(
     return truss
 
 
-Truss = Annotated[
+TrussTable = Annotated[
     ModuleTruss | TetrahedralTruss | GraphTruss,
     ByKey("module", later=("plate",), kind="module"),
     WrapValidator(_from_own_module),

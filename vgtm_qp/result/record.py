@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from vgtm_qp.errors import ResultError
 
-Shape = tuple[int | None, ...]
+Sizes = tuple[int | None, ...]
 """Sizes of the axes; None for any size."""
 
 GREATEST = 1e12
@@ -29,7 +29,7 @@ class Record:
         """Return the table of a key."""
         return Record(self._value(key), f"{self._name}.{key}")
 
-    def numbers(self, key: str, shape: Shape, *, limits: bool = False) -> NDArray[np.float64]:
+    def numbers(self, key: str, shape: Sizes, *, limits: bool = False) -> NDArray[np.float64]:
         """Return the numbers of a key. In `limits`, null means infinite."""
         array = self._array(key, shape, "numbers")
         if array.dtype.kind == "O" and limits:
@@ -44,14 +44,14 @@ class Record:
             raise self._error(key, f"numbers up to {GREATEST:g}{' or nulls' if limits else ''}")
         return np.asarray(array, dtype=np.float64)
 
-    def integers(self, key: str, shape: Shape, below: int) -> NDArray[np.int64]:
+    def integers(self, key: str, shape: Sizes, below: int) -> NDArray[np.int64]:
         """Return the integers of a key, 0 to `below` - 1."""
         array = self._array(key, shape, "integers")
         if array.size and (array.dtype.kind not in "iu" or array.min() < 0 or array.max() >= below):
             raise self._error(key, f"integers from 0 to {below - 1}")
         return np.asarray(array, dtype=np.int64)
 
-    def flags(self, key: str, shape: Shape) -> NDArray[np.bool_]:
+    def flags(self, key: str, shape: Sizes) -> NDArray[np.bool_]:
         """Return the truth values of a key."""
         array = self._array(key, shape, "truth values")
         if array.size and array.dtype.kind != "b":
@@ -80,7 +80,7 @@ class Record:
             raise ResultError(f"{self._name} lacks {key}")
         return self._data[key]
 
-    def _array(self, key: str, shape: Shape, what: str) -> NDArray[Any]:
+    def _array(self, key: str, shape: Sizes, what: str) -> NDArray[Any]:
         try:
             array = np.asarray(self._value(key))
         except (ValueError, TypeError, OverflowError):

@@ -22,7 +22,7 @@ from vgtm_qp.step.shaping import Shaping
 from vgtm_qp.step.state import State
 from vgtm_qp.step.step import Step, StepStatus
 
-Steps = list[tuple[State, float]]
+BrakingSteps = list[tuple[State, float]]
 """States, each with the value of the path reached there."""
 
 ANY_RANK = 2
@@ -57,7 +57,7 @@ class Braking:
 
     origin: State
     path: Path
-    steps: Steps
+    steps: BrakingSteps
     on_path: int
     rank: int = 0
 
@@ -130,7 +130,9 @@ class Brakes:
         target = self.shaping.target(state, self.dt, path, start, end, box)
         return self.attempt.run(state, target, progress=progress, enough=0.0)
 
-    def _along(self, state: State, path: Path, value: float, piece: float, until: float) -> Steps | None:
+    def _along(
+        self, state: State, path: Path, value: float, piece: float, until: float
+    ) -> BrakingSteps | None:
         """Brake on the path, and stay on it until a time, s.
 
         Each step aims back at the tip's present place, so that it makes as little progress as limits allow. Many
@@ -151,7 +153,7 @@ class Brakes:
 
         return self._follow(state, step, until)
 
-    def _yielding(self, state: State, value: float) -> Steps | None:
+    def _yielding(self, state: State, value: float) -> BrakingSteps | None:
         """Brake an elastic tip: its goal moves along a line, ever more slowly; its slack keeps the limits."""
         arm, kinematics = self.shaping.setup.arm, self.shaping.setup.kinematics
         kinematics.evaluate(state.q)
@@ -171,7 +173,7 @@ class Brakes:
 
         return self._follow(state, step, self._until_the_base_rests())
 
-    def _let_go(self, state: State, value: float) -> Steps | None:
+    def _let_go(self, state: State, value: float) -> BrakingSteps | None:
         """Brake every actuator by itself, wherever the tip goes; None if stations must stay on the curve."""
         setup = self.shaping.setup
         if setup.layout.hard_tracking and setup.elastic is None:
@@ -186,9 +188,9 @@ class Brakes:
 
     def _follow(
         self, state: State, step: Callable[[State, Bounds], tuple[State, float] | None], until: float
-    ) -> Steps | None:
+    ) -> BrakingSteps | None:
         """Return the steps until a time, s, and until the arm can stay; None if one fails or too many."""
-        found: Steps = []
+        found: BrakingSteps = []
         most = _MOST_STEPS
         for count in range(_MOST_STEPS + _MOST_RIDING):
             limits, values = self.actuation.box(state, self.dt), self.actuation.values(state)

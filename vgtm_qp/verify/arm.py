@@ -307,16 +307,16 @@ class RecordedArm:
         return least, *extreme_values(factors.solve(tip, trans="T")[self.actuated])
 
 
-Arm = RecordedArm | RecordedChain
+AnyRecordedArm = RecordedArm | RecordedChain
 """What both have in common is all that those know who need not know the kind."""
 
 
-def recorded_arm(record: Mapping[str, Any], members: Index) -> Arm:
+def recorded_arm(record: Mapping[str, Any], members: Index) -> AnyRecordedArm:
     """Return the arm of a manifest's record; `members` (M, 2) are the nodes of each member of a truss."""
     return RecordedChain(record) if record.get("kind") == RecordedChain.kind else RecordedArm(record, members)
 
 
-def arm_of(maneuver: Result) -> Arm:
+def arm_of(maneuver: Result) -> AnyRecordedArm:
     """Return the arm of a result; ResultError if its record is malformed, or has another number of nodes."""
     arm, count = recorded_arm(maneuver.manifest["arm"], maneuver.members), maneuver.nodes.shape[1]
     if count != len(arm.home):

@@ -12,7 +12,7 @@ import numpy as np
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.errors import ResultError
 from vgtm_qp.result.record import Record
-from vgtm_qp.verify.arm import Arm
+from vgtm_qp.verify.arm import AnyRecordedArm
 from vgtm_qp.verify.distance import segment_ball
 from vgtm_qp.verify.obstacles import Body, read_obstacles
 
@@ -28,7 +28,7 @@ class CarryingArm:
     ResultError if a record of what is carried is malformed.
     """
 
-    def __init__(self, arm: Arm, carried: Sequence[Mapping[str, Any]]) -> None:
+    def __init__(self, arm: AnyRecordedArm, carried: Sequence[Mapping[str, Any]]) -> None:
         tables = [Record(record, f"manifest.scenes.carried.{k}") for k, record in enumerate(carried)]
         self._bodies = [record["body"] for record in carried]
         ends = [table.numbers("ends", (None, 2, 3)) for table in tables]

@@ -12,7 +12,7 @@ from vgtm_qp.arrays import Array
 from vgtm_qp.result.certificate import Certificate, Measure
 from vgtm_qp.result.poses import arm_table, base_poses, rotations
 from vgtm_qp.result.result import Result
-from vgtm_qp.verify.arm import Arm, arm_of
+from vgtm_qp.verify.arm import AnyRecordedArm, arm_of
 from vgtm_qp.verify.clearance import RecordedMotion
 from vgtm_qp.verify.curve import curve_contradictions, curve_measures
 from vgtm_qp.verify.held import held_against
@@ -114,7 +114,7 @@ def verify(maneuver: Result, *, problem: Problem | None = None) -> Certificate:
     )
 
 
-def _limits(maneuver: Result, arm: Arm, lengths: Array) -> dict[str, Measure]:
+def _limits(maneuver: Result, arm: AnyRecordedArm, lengths: Array) -> dict[str, Measure]:
     """Return errors of fixed lengths or joint values (T, M) and of the base, and violations of limits.
 
     A rate is the mean over a step. An acceleration is the change of the rate from step to step over the time
@@ -191,7 +191,7 @@ def _jams_between_rows(maneuver: Result) -> list[str]:
     ]
 
 
-def _singular_values(arm: Arm, nodes: Array) -> Array:
+def _singular_values(arm: AnyRecordedArm, nodes: Array) -> Array:
     """Return (S, 3) least of the length Jacobian, least and greatest of the tip's, at S states."""
     states = np.arange(len(nodes))
     if 3 * len(arm.free) > _MANY_UNKNOWNS:

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vgtm_qp.arrays import Array, Index
-from vgtm_qp.verify.arm import Arm
+from vgtm_qp.verify.arm import AnyRecordedArm
 from vgtm_qp.verify.carrying import CarryingArm
 from vgtm_qp.verify.convex import hull_distance, of_each
-from vgtm_qp.verify.distance import Separation, segment_segment
+from vgtm_qp.verify.distance import DistanceAndNormal, segment_segment
 from vgtm_qp.verify.obstacles import Body
 
 Pairs = tuple[Index, Index]
@@ -46,7 +46,7 @@ class RecordedMotion:
     `first` on.
     """
 
-    def __init__(self, arm: Arm | CarryingArm, time: Array, states: Array, first: int = 0) -> None:
+    def __init__(self, arm: AnyRecordedArm | CarryingArm, time: Array, states: Array, first: int = 0) -> None:
         self.arm, self.time, self.states, self.first = arm, time, states, first
         # No bound is nearer than the rounding of positions.
         rounding = 64.0 * float(np.finfo(float).eps) * self.furthest
@@ -76,7 +76,7 @@ class RecordedMotion:
         """Greatest coordinate of an end, m."""
         return max(float(np.abs(corners).max(initial=0.0)) for corners in self.boxes)
 
-    def part(self, first: int, last: int, arm: Arm | CarryingArm | None = None) -> RecordedMotion:
+    def part(self, first: int, last: int, arm: AnyRecordedArm | CarryingArm | None = None) -> RecordedMotion:
         """Return the motion from the state `first` to the state `last`, of an `arm` that carries something if given."""
         if arm is None and (first, last) == (0, len(self.time) - 1):
             return self
@@ -136,7 +136,7 @@ class Encounters(ABC):
         """
 
     @abstractmethod
-    def separation(self, points: Array, pair: Pairs, near: Array | None = None) -> Separation:
+    def separation(self, points: Array, pair: Pairs, near: Array | None = None) -> DistanceAndNormal:
         """Return the exact surface distance (P,), m, and the normal (P, 3) at those points.
 
         The search for those of hulls begins `near` (P, 3) the normals, if given.
@@ -306,7 +306,7 @@ class AgainstBody(Encounters):
         """Return (P, V, 3) the ends of the members, seen from the centre of the body."""
         return np.asarray(ends(pair[0]) - self.body.at(time)[:, None])
 
-    def separation(self, points: Array, pair: Pairs, near: Array | None = None) -> Separation:
+    def separation(self, points: Array, pair: Pairs, near: Array | None = None) -> DistanceAndNormal:
         """Return surface distances and normals."""
         distance, normal = of_each(
             self.with_hull(pair),
@@ -379,7 +379,7 @@ class AgainstMembers(Encounters):
         """Return (P, 2 V, 3) the ends of both members."""
         return np.concatenate([ends(member) for member in pair], axis=1)
 
-    def separation(self, points: Array, pair: Pairs, near: Array | None = None) -> Separation:
+    def separation(self, points: Array, pair: Pairs, near: Array | None = None) -> DistanceAndNormal:
         """Return surface distances and normals."""
         distance, normal = body_distance(points, self.with_hull(pair), near)
         return distance - self.radii(pair), normal
@@ -405,7 +405,7 @@ class AgainstMembers(Encounters):
         return np.asarray(self.motion.arm.radius[pair[0]] + self.motion.arm.radius[pair[1]])
 
 
-def apart_at_home(arm: Arm, resolution: float) -> list[str]:
+def apart_at_home(arm: AnyRecordedArm, resolution: float) -> list[str]:
     """Return the pairs of bodies recorded as touching at home that are further apart there than the `resolution`, m."""
     first, second = arm.touching.T
     ends = arm.ends(arm.home)
@@ -416,7 +416,7 @@ def apart_at_home(arm: Arm, resolution: float) -> list[str]:
     return [f"{names[a]} / {names[b]} do not touch at home" for a, b in arm.touching[apart].tolist()]
 
 
-def body_distance(points: Array, hull: NDArray[np.bool_], near: Array | None = None) -> Separation:
+def body_distance(points: Array, hull: NDArray[np.bool_], near: Array | None = None) -> DistanceAndNormal:
     """Return distances (P,), m, and normals (P, 3) between two bodies of the arm each, without their radii.
 
     `points` (P, 2 V, 3) are the ends or vertices of both; `hull` (P,) says where at least one of them is a hull,
@@ -424,7 +424,7 @@ def body_distance(points: Array, hull: NDArray[np.bool_], near: Array | None = N
     """
     count = points.shape[1] // 2
 
-    def hulls(own: Index) -> Separation:
+    def hulls(own: Index) -> DistanceAndNormal:
         others = points[own, count:]
 
         def furthest(direction: Array, rows: Index) -> Array:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from vgtm_qp.arrays import Array, Index
-from vgtm_qp.verify.distance import Separation
+from vgtm_qp.verify.distance import DistanceAndNormal
 
 Furthest = Callable[[Array, Index], Array]
 """From normals (Q, 3) and the numbers (Q,) of pairs to the furthest points of the other bodies along them (Q, 3), m."""
@@ -37,8 +37,10 @@ _WAYS: Array = np.array([way for way in itertools.product((-1.0, 0.0, 1.0), repe
 
 
 def of_each(
-    hull: NDArray[np.bool_], axes: Callable[[Index], Separation], hulls: Callable[[Index], Separation]
-) -> Separation:
+    hull: NDArray[np.bool_],
+    axes: Callable[[Index], DistanceAndNormal],
+    hulls: Callable[[Index], DistanceAndNormal],
+) -> DistanceAndNormal:
     """Return distances (P,) and normals (P, 3): `hulls` of the rows that have a `hull` (P,), `axes` of the others."""
     rows = np.flatnonzero(~hull)
     if len(rows) == len(hull):
@@ -51,7 +53,7 @@ def of_each(
     return distance, normal
 
 
-def hull_distance(vertices: Array, furthest: Furthest, near: Array | None = None) -> Separation:
+def hull_distance(vertices: Array, furthest: Furthest, near: Array | None = None) -> DistanceAndNormal:
     """Return the distances (P,), m, of hulls with `vertices` (P, V, 3) from other bodies, and normals (P, 3).
 
     The search is short where it begins `near` (P, 3) the normals; zero where these are unknown.
@@ -138,7 +140,7 @@ def _finish(look: Callable[[Array, Index], Array], normal: Array, row: Index) ->
         along = point / distance
 
 
-def _way_out(vertices: Array, furthest: Furthest, rows: Index) -> Separation:
+def _way_out(vertices: Array, furthest: Furthest, rows: Index) -> DistanceAndNormal:
     """Return the gaps (Q,), m, of overlapping bodies along the best (Q, 3) of some directions."""
     found, best = np.full(len(rows), -np.inf), np.zeros((len(rows), 3))
     for way in _WAYS / np.linalg.norm(_WAYS, axis=1)[:, None] if len(rows) else ():

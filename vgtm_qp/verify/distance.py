@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from vgtm_qp.arrays import Array
 
-Separation = tuple[Array, Array]
+DistanceAndNormal = tuple[Array, Array]
 
 
-def segment_box(start: Array, end: Array, half: Array) -> Separation:
+def segment_box(start: Array, end: Array, half: Array) -> DistanceAndNormal:
     """Segments against the solid boxes |x_i| <= half_i; `half` is (3,) or (P, 3), m.
 
     The squared distance is convex and piecewise quadratic along the segment, with a break wherever the
@@ -46,7 +46,7 @@ def _beyond(points: Array, half: Array) -> Array:
     return points - np.clip(points, -half, half)
 
 
-def segment_ball(start: Array, end: Array, radius: float | Array) -> Separation:
+def segment_ball(start: Array, end: Array, radius: float | Array) -> DistanceAndNormal:
     """Segments against the solid balls round the origin; `radius` is one number or (P,), m."""
     point = _to_segment(np.zeros(3), start, end - start)
     span = np.linalg.norm(point, axis=1)
@@ -56,7 +56,7 @@ def segment_ball(start: Array, end: Array, radius: float | Array) -> Separation:
 
 def segment_cylinder(
     start: Array, end: Array, radius: float | Array, half_height: float | Array
-) -> Separation:
+) -> DistanceAndNormal:
     """Segments against the solid cylinders round the z axis, |z| <= half_height; both sizes one number or (P,), m.
 
     The squared distance to a convex body is convex along the segment and differentiable. Its minimum is where
@@ -84,7 +84,7 @@ def _beyond_cylinder(points: Array, sizes: Array) -> Array:
     return np.concatenate([radial, axial], axis=-1)
 
 
-def segment_segment(start: Array, end: Array, other_start: Array, other_end: Array) -> Separation:
+def segment_segment(start: Array, end: Array, other_start: Array, other_end: Array) -> DistanceAndNormal:
     """Segments against segments: the four ends, and the common perpendicular where both reach it."""
     first, second = end - start, other_end - other_start
     between = start - other_start
@@ -113,7 +113,7 @@ def _to_segment(point: Array, start: Array, along: Array) -> Array:
     return np.asarray(point - start - share[:, None] * along)
 
 
-def segment_triangle(start: Array, end: Array, triangle: Array) -> Separation:
+def segment_triangle(start: Array, end: Array, triangle: Array) -> DistanceAndNormal:
     """Segments against triangles (P, 3, 3): ends above the face, the three edges, or zero where pierced."""
     origin = triangle[:, 0]
     u, v = triangle[:, 1] - origin, triangle[:, 2] - origin
@@ -149,7 +149,7 @@ def _over(point: Array, u: Array, v: Array, normal: Array, area: Array) -> NDArr
     return np.asarray((beta >= 0.0) & (gamma >= 0.0) & (beta + gamma <= 1.0))
 
 
-def _nearest(apart: Array) -> Separation:
+def _nearest(apart: Array) -> DistanceAndNormal:
     """Return length and direction of the shortest of the vectors `apart` (P, C, 3)."""
     lengths = np.linalg.norm(apart, axis=2)
     best = np.argmin(lengths, axis=1)

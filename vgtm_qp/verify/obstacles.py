@@ -15,7 +15,13 @@ from numpy.typing import NDArray
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.result.poses import rotation_matrix
 from vgtm_qp.verify.convex import hull_distance
-from vgtm_qp.verify.distance import Separation, segment_ball, segment_box, segment_cylinder, segment_triangle
+from vgtm_qp.verify.distance import (
+    DistanceAndNormal,
+    segment_ball,
+    segment_box,
+    segment_cylinder,
+    segment_triangle,
+)
 
 _GREATEST = 1e6
 """Greatest coordinate of a mesh, in its file's unit: squares of such numbers are exact enough."""
@@ -29,7 +35,7 @@ class Shape:
     """(K, C, 3) points whose convex hulls hold the pieces, m."""
     sizes: Array
     """(K, ...) the sizes of each piece, m, for the functions below."""
-    distance: Callable[[Array, Array, Array], Separation]
+    distance: Callable[[Array, Array, Array], DistanceAndNormal]
     """Distances and normals of P segments, from start to end (P, 3), against pieces of sizes (P, ...)."""
     furthest: Callable[[Array, Array], Array]
     """The points (P, 3) of pieces of sizes (P, ...) that are furthest along normals (P, 3), m."""
@@ -40,7 +46,7 @@ class Shape:
         """Return the greatest ``normal . x`` (P,) over the points x of pieces of `sizes` for normals (P, 3), m."""
         return np.asarray(np.einsum("pc,pc->p", normal, self.furthest(normal, sizes)))
 
-    def hull_distance(self, vertices: Array, sizes: Array, near: Array | None = None) -> Separation:
+    def hull_distance(self, vertices: Array, sizes: Array, near: Array | None = None) -> DistanceAndNormal:
         """Return distances (P,) and normals (P, 3) of hulls of `vertices` (P, V, 3) against pieces of `sizes`."""
         if self.furthest is _ball_furthest:
             distance, normal = hull_distance(vertices, lambda normal, _: np.zeros_like(normal), near)
@@ -85,7 +91,7 @@ def _unit(vectors: Array) -> Array:
     return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1), 1e-300)[:, None])
 
 
-def _cylinder_distance(start: Array, end: Array, sizes: Array) -> Separation:
+def _cylinder_distance(start: Array, end: Array, sizes: Array) -> DistanceAndNormal:
     return segment_cylinder(start, end, sizes[:, 0], sizes[:, 1])
 
 
@@ -120,13 +126,13 @@ class Body:
         """Return (K, C, 3) points whose convex hulls hold the K convex pieces, m."""
         return np.asarray(self.shape.corners @ self.rotation.T)
 
-    def separation(self, start: Array, end: Array, piece: Index) -> Separation:
+    def separation(self, start: Array, end: Array, piece: Index) -> DistanceAndNormal:
         """Return distances and normals of P segments against the pieces (P,) of this body."""
         start, end = start @ self.rotation, end @ self.rotation
         distance, normal = self.shape.distance(start, end, self.shape.sizes[piece])
         return distance, normal @ self.rotation.T
 
-    def hull_separation(self, vertices: Array, piece: Index, near: Array | None = None) -> Separation:
+    def hull_separation(self, vertices: Array, piece: Index, near: Array | None = None) -> DistanceAndNormal:
         """Return distances and normals of P convex hulls of `vertices` (P, V, 3) against the pieces (P,).
 
         See :func:`~vgtm_qp.verify.convex.hull_distance` for `near`.

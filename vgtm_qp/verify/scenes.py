@@ -14,7 +14,7 @@ from vgtm_qp.errors import ResultError
 from vgtm_qp.result.certificate import Measure
 from vgtm_qp.result.manifest import scene_problem
 from vgtm_qp.result.result import Result
-from vgtm_qp.verify.arm import Arm
+from vgtm_qp.verify.arm import AnyRecordedArm
 from vgtm_qp.verify.carrying import CarryingArm
 from vgtm_qp.verify.clearance import (
     BETWEEN_TOLERANCE,
@@ -60,7 +60,7 @@ class _Scene(NamedTuple):
     arm: CarryingArm | None = None
 
 
-def clearances_of(maneuver: Result, arm: Arm, motion: RecordedMotion) -> Clearances:
+def clearances_of(maneuver: Result, arm: AnyRecordedArm, motion: RecordedMotion) -> Clearances:
     """Return the clearances of a maneuver whose `arm` moved like `motion`.
 
     A state at which the scene changed has to keep clear in the scene before; in the one after, pairs that were too near
@@ -98,7 +98,7 @@ def clearances_of(maneuver: Result, arm: Arm, motion: RecordedMotion) -> Clearan
     )
 
 
-def _scenes_of(maneuver: Result, arm: Arm) -> Iterator[_Scene]:
+def _scenes_of(maneuver: Result, arm: AnyRecordedArm) -> Iterator[_Scene]:
     """Yield the scenes of a maneuver in the order in which it went through them."""
     manifest = maneuver.manifest
     changes = manifest.get("scenes") or []

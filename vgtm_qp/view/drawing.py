@@ -17,7 +17,7 @@ from vgtm_qp.problem.urdf import UrdfVisual
 from vgtm_qp.result.manifest import scene_problem
 from vgtm_qp.result.result import Result
 from vgtm_qp.rotation import rotation_from_vector
-from vgtm_qp.verify.arm import Arm, arm_of
+from vgtm_qp.verify.arm import AnyRecordedArm, arm_of
 from vgtm_qp.verify.curve import TRACKING_TOLERANCE, greatest_gaps
 from vgtm_qp.view.links import link_surfaces
 
@@ -153,7 +153,7 @@ class Drawing:
     """
 
     name: str
-    arm: Arm
+    arm: AnyRecordedArm
     curve_weights: Array
     obstacles: tuple[ObstacleMesh, ...]
     problem: Mapping[str, Any]
@@ -276,7 +276,9 @@ def _lifetimes(
     return [*found, *((entry, since, np.inf) for entry, since in there)]
 
 
-def make_drawing(problem: Mapping[str, Any], arm: Arm, vertices: int, directory: str | Path) -> Drawing:
+def make_drawing(
+    problem: Mapping[str, Any], arm: AnyRecordedArm, vertices: int, directory: str | Path
+) -> Drawing:
     """Return the drawing of an arm, with `vertices` control vertices, among the obstacles of a problem."""
     weights = np.zeros((0, vertices))
     spec = problem.get("curve")

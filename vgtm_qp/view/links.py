@@ -12,13 +12,13 @@ from vgtm_qp.arrays import Array
 from vgtm_qp.errors import VgtmError
 from vgtm_qp.problem.urdf import UrdfVisual, read_visuals
 from vgtm_qp.rotation import quaternion
-from vgtm_qp.verify.arm import Arm
+from vgtm_qp.verify.arm import AnyRecordedArm
 
 _SAME = 1e-9
 """Difference of joints, m or 1, up to which the URDF file is still that of the arm."""
 
 
-def link_surfaces(problem: Mapping[str, Any], arm: Arm, directory: Path) -> tuple[UrdfVisual, ...]:
+def link_surfaces(problem: Mapping[str, Any], arm: AnyRecordedArm, directory: Path) -> tuple[UrdfVisual, ...]:
     """Return what the URDF file of a problem draws of the arm's links.
 
     Nothing without such a file, and nothing where its joints are no longer those of the arm.
@@ -46,7 +46,7 @@ def link_surfaces(problem: Mapping[str, Any], arm: Arm, directory: Path) -> tupl
 class LinkScene:
     """Surfaces of links in a viser scene, each in the frame of the joint that moves it."""
 
-    def __init__(self, scene: Any, arm: Arm, surfaces: Sequence[UrdfVisual]) -> None:
+    def __init__(self, scene: Any, arm: AnyRecordedArm, surfaces: Sequence[UrdfVisual]) -> None:
         self._arm = arm
         self._frames = {
             k: scene.add_frame(f"/links/{k}", show_axes=False) for k in {s.joint for s in surfaces}

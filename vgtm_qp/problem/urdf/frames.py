@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vgtm_qp.arrays import Array
 from vgtm_qp.problem.urdf.text import Element, Mistakes
 
-Array = NDArray[np.float64]
 Frame = tuple[Array, Array]
 """An origin (3,), m, and an attitude (3, 3)."""
 

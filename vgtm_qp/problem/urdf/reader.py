@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vgtm_qp.arrays import Array
 from vgtm_qp.errors import nearest
 from vgtm_qp.problem.fields import quoted
 from vgtm_qp.problem.urdf.frames import AT_REST, Frame, Origins, after, inverse
@@ -18,9 +18,7 @@ from vgtm_qp.problem.urdf.shapes import Shapes
 from vgtm_qp.problem.urdf.text import Element, Mistakes, read_xml
 from vgtm_qp.problem.urdf.visuals import UrdfVisual, surfaces_of
 
-Array = NDArray[np.float64]
-
-Place = tuple[int, Frame]
+LinkPlace = tuple[int, Frame]
 """Number of moving joints before a link, and its frame in that of the last of these."""
 
 _MOVING = ("revolute", "continuous", "prismatic")
@@ -329,7 +327,7 @@ class _Tree:
             joint = joints[other]
 
     def moving(
-        self, chain: Sequence[_Joint], places: Mapping[str, Place]
+        self, chain: Sequence[_Joint], places: Mapping[str, LinkPlace]
     ) -> tuple[tuple[UrdfJoint, ...], Frame]:
         """Return the moving joints of the chain, each in the frame of the one before, and the tip in the last."""
         found, frame, masses = list[UrdfJoint](), AT_REST, self._masses(places)
@@ -340,7 +338,7 @@ class _Tree:
                 frame = AT_REST
         return tuple(found), frame
 
-    def _masses(self, places: Mapping[str, Place]) -> dict[int, Mass]:
+    def _masses(self, places: Mapping[str, LinkPlace]) -> dict[int, Mass]:
         """Return what links weigh together, by the number of moving joints before them."""
         found: dict[int, Mass] = {}
         for link, (number, frame) in places.items():
@@ -348,7 +346,7 @@ class _Tree:
             found[number] = found.get(number, WEIGHTLESS) + own
         return found
 
-    def places(self, chain: Sequence[_Joint], base: str) -> tuple[dict[str, Place], tuple[str, ...]]:
+    def places(self, chain: Sequence[_Joint], base: str) -> tuple[dict[str, LinkPlace], tuple[str, ...]]:
         """Return where the chain's links and those fixed to them are, and notes of what is left out."""
         places, number, frame = {base: (0, AT_REST)}, 0, AT_REST
         for joint in chain:
@@ -374,7 +372,7 @@ class _Tree:
         return places, tuple(notes)
 
     def bodies(
-        self, places: Mapping[str, Place], shapes: Shapes
+        self, places: Mapping[str, LinkPlace], shapes: Shapes
     ) -> tuple[tuple[UrdfBody, ...], tuple[str, ...]]:
         """Return bodies of links at their places, and notes of links that have none."""
         bodies, notes = list[UrdfBody](), list[str]()
@@ -386,7 +384,7 @@ class _Tree:
         bodies.sort(key=lambda body: body.joint)
         return tuple(bodies), tuple(notes)
 
-    def visuals(self, places: Mapping[str, Place], shapes: Shapes) -> Iterator[UrdfVisual]:
+    def visuals(self, places: Mapping[str, LinkPlace], shapes: Shapes) -> Iterator[UrdfVisual]:
         """Yield what is drawn of links at their places."""
         for link, (number, frame) in places.items():
             for visual in self._links[link].all("visual"):

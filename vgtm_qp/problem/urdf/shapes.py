@@ -21,7 +21,7 @@ _HEAD = 1_000_000
 _KINDS = "box, cylinder, sphere, capsule, mesh"
 
 
-Points = tuple[Array, float]
+RoundedPoints = tuple[Array, float]
 """A ball's centre (1, 3), both ends of a capsule's axis (2, 3), or points (K, 3) of a hull; and the radius, m."""
 
 
@@ -37,7 +37,7 @@ class Shapes:
         self.files: list[Path] = []
         self._meshes: dict[Path, Array] = {}
 
-    def body(self, collision: Element, what: str) -> Points | None:
+    def body(self, collision: Element, what: str) -> RoundedPoints | None:
         """Return what stands for a <collision>, in the frame of its <origin>; None where the shape is wrong."""
         geometry = collision.first("geometry")
         shapes = [] if geometry is None else geometry.children
@@ -73,7 +73,7 @@ class Shapes:
         mistakes.add(shape, what, f"<{shape.tag}>", f"one of {_KINDS}")
         return None
 
-    def _hull(self, points: Array) -> Points:
+    def _hull(self, points: Array) -> RoundedPoints:
         """Return the hull of points (K, 3), or a capsule round them if capsules are wanted or they are in one plane."""
         if self._bodies == "capsule" or not spans_volume(points):
             return enclosing_capsule(points)
