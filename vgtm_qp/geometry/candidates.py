@@ -18,8 +18,11 @@ Motion = tuple[Displacement, Displacement, Displacement]
 
 _TO_PIECES, _RIGID, _BENDING = range(3)
 
-_FEW_PAIRS = 40_000
-"""Greatest number of bodies, times that of bodies and pieces, of a scene that lists all pairs."""
+_LISTED_ONCE = 40_000
+"""Greatest number of bodies, times that of bodies and pieces, of a scene whose pairs are all listed.
+
+Ten times that of ``watch``: C lists pairs again at less cost.
+"""
 
 _MOST_BENDING = 0.5
 """Share of bending pairs of parts above which all bodies are compared again."""
@@ -104,7 +107,7 @@ class Candidates:
         drift = 0.0 if end_time is None else pieces.fastest * abs(end_time - time)
         horizon = max(reach, self._influence) + self._influence + travel + drift
         self_horizon = max(self_reach, self._self_influence) + self._influence + 2.0 * travel
-        if len(bodies) * (len(bodies) + len(pieces)) <= _FEW_PAIRS:
+        if len(bodies) * (len(bodies) + len(pieces)) <= _LISTED_ONCE:
             # A list of all pairs never needs another broad phase, which would cost more than its far pairs.
             horizon = self_horizon = FAR
         if not self._lists:
