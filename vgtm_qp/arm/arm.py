@@ -586,9 +586,9 @@ def between(start: Array, end: Array, pieces: int) -> Array:
     return np.asarray((1.0 - shares) * start + shares * end)
 
 
-def rank(values: NDArray[Any]) -> int:
+def rank(values: NDArray[Any], tolerance: float = RANK_TOLERANCE) -> int:
     """Return the rank of a Jacobian with these singular values."""
-    return int(np.count_nonzero(values > RANK_TOLERANCE * values.max(initial=0.0)))
+    return int(np.count_nonzero(values > tolerance * values.max(initial=0.0)))
 
 
 def has_full_rank(rows: Array) -> bool:

@@ -15,7 +15,7 @@ from vgtm_qp.arrays import Array, Index, Mask
 from vgtm_qp.errors import SolverError
 from vgtm_qp.methods.objectives import DEFAULT_TERMS, NamedTerms, Terms
 from vgtm_qp.methods.pseudoinverse import (
-    RANK_TOLERANCE,
+    TRUNCATION,
     Cost,
     moore_penrose,
     null_space_vector,
@@ -66,7 +66,7 @@ class Resolved(NamedTuple):
 def resolved(J: Array, x: Array, objective: Cost, method: Method) -> Resolved:
     """Return J^+ x + (1 - J^+ J) v with the null-space vector v of `objective`, by the method's variant."""
     if method.variant in ("moore-penrose", "truncated"):
-        truncation = method.truncation if method.variant == "truncated" else RANK_TOLERANCE
+        truncation = method.truncation if method.variant == "truncated" else TRUNCATION
         inverse = moore_penrose(J, truncation=truncation)
     else:
         inverse = weighted(

@@ -10,7 +10,8 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve, cholesky, solve_tri
 from vgtm_qp.arrays import Array
 from vgtm_qp.errors import SolverError
 
-RANK_TOLERANCE = 1e-10
+TRUNCATION = 1e-10
+"""Singular values below this fraction of the greatest one are rounding, which every inverse leaves out."""
 
 
 class Inverse(NamedTuple):
@@ -27,7 +28,7 @@ class Cost(NamedTuple):
     gradient: Array
 
 
-def moore_penrose(J: Array, *, truncation: float = RANK_TOLERANCE) -> Inverse:
+def moore_penrose(J: Array, *, truncation: float = TRUNCATION) -> Inverse:
     """Return J^+ (n, m), eq. (6), by singular values; those below `truncation` times the greatest count as zero.
 
     J J^+ = 1 holds at full row rank only. A `truncation` that is not small gives the truncated inverse, which

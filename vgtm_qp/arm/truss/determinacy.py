@@ -14,13 +14,14 @@ from scipy import sparse
 from scipy.linalg import qr
 from scipy.sparse.linalg import LinearOperator, eigsh, splu
 
+from vgtm_qp.arm.arm import rank
 from vgtm_qp.arm.truss.kinematics import length_gradients
 from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.arrays import Array
 from vgtm_qp.errors import TrussError
 
-RANK_TOLERANCE = 1e-10
-"""Singular values below this fraction of the greatest one count as zero."""
+_REGULAR = 1e-10
+"""Singular values of a whole truss below this fraction of the greatest one count as zero: many bays have small ones."""
 
 _DENSE_LIMIT = 450
 """Above this many unknown coordinates, Lanczos iteration on a sparse LU beats the dense decomposition."""
@@ -69,7 +70,7 @@ def check_determinacy(truss: Truss, X: Array | None = None) -> DeterminacyReport
         raise TrussError("every node is fixed: nothing can move; expected at least one node that is not")
     if members == coordinates:
         smallest, greatest = _extreme_singular_values(matrix)
-        if smallest > RANK_TOLERANCE * greatest:
+        if smallest > _REGULAR * greatest:
             return DeterminacyReport(members, coordinates, coordinates, smallest, greatest / smallest)
     raise TrussError(_refusal(truss, matrix))
 
@@ -120,8 +121,8 @@ def _null_spaces(J: sparse.csc_array) -> tuple[Array, Array]:
     if max(J.shape) > _DENSE_LIMIT:
         return _sparse_null_space(J), _sparse_null_space(sparse.csc_array(J.T))
     left, values, right = np.linalg.svd(J.toarray())
-    rank = int(np.count_nonzero(values > RANK_TOLERANCE * values.max(initial=0.0)))
-    return right[rank:].T, left[:, rank:]
+    kept = rank(values, _REGULAR)
+    return right[kept:].T, left[:, kept:]
 
 
 def _sparse_null_space(J: sparse.csc_array) -> Array:
