@@ -28,6 +28,10 @@ def braking_speed(distance: Array, acceleration: Array, dt: float) -> Array:
 APPROACH = 0.3
 """Largest share of the distance to the end of its stroke that an actuator that slows down uses in one step."""
 
+LEAST_APPROACH = 2e-3
+"""Approach, of an actuator to that end or of a pair, that is always allowed in one step: rad, or over the arm's unit.
+"""
+
 
 def resting_box(count: int) -> ca.Function:
     """Return :func:`actuator_box` of actuators without limits of their acceleration, all (n_a,).

@@ -11,22 +11,19 @@ from vgtm_qp.arrays import Array
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.errors import GoalError, nearest
 from vgtm_qp.qp.settle import enough_length
-from vgtm_qp.rows.limits import actuator_box, binding, resting_box
+from vgtm_qp.rows.limits import LEAST_APPROACH, actuator_box, binding, resting_box
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import State
 
 Bounds = tuple[Array, Array]
 """Least and greatest values (n_a,) of the actuators after a step."""
 
-_LEAST_APPROACH = 2e-3
-"""Approach to the end of a stroke that is always allowed in one step: rad, or a share of the arm's unit."""
-
 _SPARE_RATE = 1e-6
 """Greatest share of a rate that is kept in reserve for the errors of settling."""
 
 _ROUNDING = float(np.finfo(float).eps)
 
-_INSTANT = 1e-9
+INSTANT = 1e-9
 """Times that differ by less are the same, s."""
 
 
@@ -108,7 +105,7 @@ class Actuation:
         self.tolerance = 1e-10 * arm.fineness if self.starts_at_once else exact
         self._settled = enough_length(arm.home_configuration, self.tolerance)
         self._slows_down = setup.slows_down and self.starts_at_once
-        self._least_approach = _LEAST_APPROACH * arm.unit / arm.levers
+        self._least_approach = LEAST_APPROACH * arm.unit / arm.levers
         self._pace: tuple[float, Array, Array] = 0.0, self._rate, self._rate
         self.locked: set[str] = set()
         self._held = np.zeros(len(self.names), dtype=bool)
@@ -142,14 +139,14 @@ class Actuation:
     def jammed(self, time: float) -> list[str]:
         """Return the names of the actuators that jam by `time`, s, each once."""
         found = []
-        while self._jams and self._jams[-1][1] <= time + _INSTANT:
+        while self._jams and self._jams[-1][1] <= time + INSTANT:
             found.append(self._jams.pop()[0])
         return found
 
     def until_jam(self, time: float, dt: float) -> float:
         """Return the share of a step of `dt` from `time`, s, that ends at the next jam; 1 without a jam."""
         left = self._jams[-1][1] - time if self._jams else np.inf
-        return left / dt if left < dt - _INSTANT else 1.0
+        return left / dt if left < dt - INSTANT else 1.0
 
     def box(self, state: State, dt: float) -> Bounds:
         """Return the least and greatest values of the actuators after a step of `dt`, s, from `state`."""

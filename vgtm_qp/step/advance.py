@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vgtm_qp.step.actuation import Actuation, within
+from vgtm_qp.step.actuation import INSTANT, Actuation, within
 from vgtm_qp.step.attempt import FURTHER, Attempt, Tracking
 from vgtm_qp.step.braking import ANY_RANK, Brakes, Braking
 from vgtm_qp.step.setup import TOO_LONG
@@ -27,8 +27,6 @@ _LONGER = 2.0
 
 _BEYOND = 60.0
 """Length of the continuation on which an arm at the end of its path may brake, over the path's last piece."""
-
-_INSTANT = 1e-9
 
 _LEAST_HELD = 0.5
 """Least share of a piece of path for which stations that may leave the curve stay on it."""
@@ -108,9 +106,9 @@ class Advancer:
 
     def first_share(self, target: Target) -> float:
         """Return the share of a target's piece that is tried first; below 1 if the step limit requires it."""
-        if self._tip_mode != "scaled" or not self._step_limit < np.inf:
-            return 1.0
-        return min(1.0, self._step_limit / max(self._asked(target), _INSTANT))
+        is_limited = self._tip_mode == "scaled" and self._step_limit < np.inf
+        asked = self._asked(target) if is_limited else 0.0
+        return self._step_limit / asked if asked > self._step_limit else 1.0
 
     def _held_or_free(
         self, state: State, target: Target, dt: float, first: float, smallest: float
@@ -192,7 +190,7 @@ class Advancer:
         if not self._actuation.starts_at_once:
             path, covered = target.path, step.progress * (target.end - target.start)
             reached = target.start + covered
-            if reached >= path.end - _INSTANT:
+            if reached >= path.end - INSTANT:
                 # The path beyond its end is unknown.
                 path = path.continued(_BEYOND)
             braking = self.brakes(dt).find(step.state, path, reached, 2.0 * covered)

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vgtm_qp.step.actuation import Actuation, Bounds
+from vgtm_qp.step.actuation import INSTANT, Actuation, Bounds
 from vgtm_qp.step.attempt import Attempt
 from vgtm_qp.step.closing import Closing
 from vgtm_qp.step.path import Path
@@ -37,9 +37,6 @@ _GENTLER = (0.5, 0.75)
 
 _MOST_RIDING = 500
 """Greatest number of braking steps on a moving base."""
-
-_INSTANT = 1e-9
-"""Times that differ by less are the same, s."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +120,7 @@ class Brakes:
     def _until_the_base_rests(self) -> float:
         """Return the time from which the base rests, s."""
         base = self.shaping.setup.base_motion
-        return -np.inf if base is None else base.end - _INSTANT
+        return -np.inf if base is None else base.end - INSTANT
 
     def _done(self, state: State, path: Path, start: float, end: float, box: Bounds, progress: float) -> Step:
         """Return the attempt at a piece of path of which the tip has already covered `progress`."""

@@ -17,6 +17,7 @@ from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.qp.terms import OwnTerms
 from vgtm_qp.rows.angles import angle_gradients, angles, corners
 from vgtm_qp.rows.clearance import allowed, allowed_function, clearance_rows
+from vgtm_qp.rows.limits import LEAST_APPROACH
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.state import Shortfall, State
 
@@ -28,9 +29,6 @@ _ROUNDING = 1e-10
 
 _APPROACH = 0.4
 """Largest share of its remaining clearance that a pair may use in one step."""
-
-_LEAST_APPROACH = 2e-3
-"""Approach that a slowing pair is always allowed in one step, over the arm's unit."""
 
 MOST_PIECES = 16
 """Greatest number of pieces into which a motion is cut if points leave their chords."""
@@ -56,7 +54,7 @@ class Separation:
         self._setup, self._arm, self._monitor = setup, setup.carrier, setup.monitor
         self._approach = _APPROACH if setup.slows_down else 1.0
         self._unit, self._rounding = setup.arm.unit, _ROUNDING * setup.arm.fineness
-        self._least, self._between = _LEAST_APPROACH * self._unit, _BETWEEN * self._unit
+        self._least, self._between = LEAST_APPROACH * self._unit, _BETWEEN * self._unit
         own = setup.layout.own
         self._own = own if own is not None and own.rows else None
         meeting = setup.monitor.bodies.joints
