@@ -19,6 +19,7 @@ from vgtm_qp.methods.resolver import MethodResolver, Moved
 from vgtm_qp.problem import Problem
 from vgtm_qp.rows.tip import TipGoal, axes, turned_axes
 from vgtm_qp.step.actuation import Bounds, within
+from vgtm_qp.step.advance import SMALLEST, TRUST
 from vgtm_qp.step.build import build_arm
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.separation import Separation
@@ -45,13 +46,6 @@ _OPTIONS: dict[str, Any] = {
 _PAIRS = 60
 _ROUNDS = 8
 """Greatest number of rows of pairs, and of programs until the exact clearances hold."""
-
-_SMALLEST = 1 / 64
-"""Least share of a piece of path that is tried."""
-
-_TRUST = 0.2
-"""Greatest change of an actuator per share of the step, rad or a share of the arm's unit, after the whole step failed.
-"""
 
 _ARRIVED = 1e-7
 """Share of a piece that an interior point leaves uncovered at its end."""
@@ -232,7 +226,7 @@ class NonlinearResolver(MethodResolver):
             step = super()._follow(path, start, start + self._share * (end - start), dt, whole)
             if step.moved:
                 return step.over(self._share * self._progress, None)
-            if not may_slow or self._share <= _SMALLEST:
+            if not may_slow or self._share <= SMALLEST:
                 return step
             self._share /= 2.0
 
@@ -266,7 +260,7 @@ class NonlinearResolver(MethodResolver):
         arm, box = self.setup.arm, self._actuation.box(state, dt)
         if self._share == 1.0:
             return box
-        return within(box, self._actuation.values(state), self._share * _TRUST * arm.unit / arm.levers)
+        return within(box, self._actuation.values(state), self._share * TRUST * arm.unit / arm.levers)
 
     def _refuse_breakdown(self, nodes: Array, path: Path, start: float, end: float) -> None:  # noqa: ARG002
         """Raise SolverError if a node moves further than the problem allows; nothing is linear here."""

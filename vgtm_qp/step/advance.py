@@ -18,7 +18,10 @@ from vgtm_qp.step.step import WHOLE, Step, StepStatus
 from vgtm_qp.step.stops import CANNOT_BRAKE
 from vgtm_qp.step.target import Target
 
-_TRUST = 0.2
+SMALLEST = 1 / 64
+"""Least share of a piece of path that an arm at rest tries."""
+
+TRUST = 0.2
 """Greatest change of an actuator per share of the step, rad or a share of the arm's unit, after the whole step failed.
 """
 
@@ -157,7 +160,7 @@ class Advancer:
             return self._try(state, target, dt, tracking=tracking)
         lower, upper = target.lower, target.upper
         if share < first:
-            longest = min(_TRUST * self._arm.unit, _LONGER * self._step_limit)
+            longest = min(TRUST * self._arm.unit, _LONGER * self._step_limit)
             values, trust = self._actuation.values(state), share * longest / self._arm.levers / first
             lower, upper = within((lower, upper), values, trust)
         piece = replace(target.part(share), lower=lower, upper=upper)

@@ -14,7 +14,7 @@ from vgtm_qp.problem import Problem
 from vgtm_qp.qp.full import StepQP
 from vgtm_qp.qp.terms import Inequality, Objective
 from vgtm_qp.step.actuation import Actuation
-from vgtm_qp.step.advance import Advancer
+from vgtm_qp.step.advance import SMALLEST, Advancer
 from vgtm_qp.step.attempt import Attempt
 from vgtm_qp.step.braking import ANY_RANK, Braking
 from vgtm_qp.step.build import build_arm
@@ -31,8 +31,8 @@ from vgtm_qp.step.step import Step
 from vgtm_qp.step.stops import Stop, explain, struck
 from vgtm_qp.step.task import duration
 
-_SMALLEST, _SMALLEST_MOVING = 1 / 64, 0.25
-"""Least share of a piece of path that an arm tries: at rest, and moving, when it can brake instead."""
+_SMALLEST_MOVING = 0.25
+"""Least share of a piece of path that a moving arm tries, which can brake instead; see ``advance.SMALLEST``."""
 
 
 class QPResolver(Resolver, serves="qp"):
@@ -143,7 +143,7 @@ class QPResolver(Resolver, serves="qp"):
     def _follow(self, path: Path, start: float, end: float, dt: float, whole: float) -> Step:
         """See :class:`Resolver`; pieces are halved until one is safe."""
         state, limits = self._state, self._actuation.limits(self._state, dt, slowing=True)
-        brake, smallest, worst = None, _SMALLEST, ANY_RANK
+        brake, smallest, worst = None, SMALLEST, ANY_RANK
         if (brake := self._braking_until_jam()) is not None:
             smallest, worst = _SMALLEST_MOVING, brake.rank
         target = self._shaping.target(state, dt, path, start, end, limits[:2])
