@@ -100,8 +100,9 @@ def test_osqp_starts_from_its_last_answer_also_with_more_rows():
     np.testing.assert_allclose(more.x, cold.x, atol=1e-9)
 
 
-def test_osqp_tries_again_where_the_first_answer_is_not_accurate(set_ups):
-    rng, solver = np.random.default_rng(5), Osqp({**FIRST, "max_iter": 10})
+def test_osqp_tries_again_where_the_first_answer_is_not_accurate(set_ups, monkeypatch):
+    monkeypatch.setitem(FIRST, "max_iter", 10)
+    rng, solver = np.random.default_rng(5), Osqp()
     for _ in range(3):
         qp = random_qp(rng, 4)
         answer = solver.ask(qp)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -52,19 +52,11 @@ class Osqp(DenseSolver):
 
     All rows of the workspace are dense. Unused rows are zero and have infinite bounds, so that the sparsity
     does not change when near pairs come and go.
-
-    Parameters
-    ----------
-    first, again
-        Settings of the first try, and of further ones where its answer is not accurate.
     """
 
     accuracy = 1e-8
 
-    def __init__(
-        self, first: Mapping[str, float] = FIRST, again: Sequence[Mapping[str, float]] = AGAIN
-    ) -> None:
-        self._first, self._after = first, again
+    def __init__(self) -> None:
         self._workspace: _OsqpWorkspace | None = None
         self._further: list[_OsqpWorkspace] = []
 
@@ -91,10 +83,10 @@ class Osqp(DenseSolver):
         """Return the workspace in use, a larger one that starts from its answer, or an unused one."""
         old = self._workspace
         if old is None or old.sizes[:2] != (size, bounded):
-            return _OsqpWorkspace(size, bounded, rows + _SPARE, self._first)
+            return _OsqpWorkspace(size, bounded, rows + _SPARE, FIRST)
         if rows <= old.sizes[2]:
             return old
-        return _OsqpWorkspace(size, bounded, max(rows, 2 * old.sizes[2]), self._first, start=old.last)
+        return _OsqpWorkspace(size, bounded, max(rows, 2 * old.sizes[2]), FIRST, start=old.last)
 
     def _again(
         self, workspace: _OsqpWorkspace, answer: DenseAnswer | None, off: float, qp: DenseQP
@@ -107,7 +99,7 @@ class Osqp(DenseSolver):
             There is no answer, or none is accurate.
         """
         if not self._further or self._further[0].sizes != workspace.sizes:
-            self._further = [_OsqpWorkspace(*workspace.sizes, settings) for settings in self._after]
+            self._further = [_OsqpWorkspace(*workspace.sizes, settings) for settings in AGAIN]
         for further in self._further:
             further.restart(answer if off <= _NEAR else None)
             found = further.solved(qp)
