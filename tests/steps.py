@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 from vgtm_qp.arm.arm import Kinematics, Pose
 from vgtm_qp.curve.families import make_family
+from vgtm_qp.problem import Problem
 from vgtm_qp.qp.answer import StepSolution
 from vgtm_qp.qp.full import FullBuilder, StepQP
 from vgtm_qp.qp.layout import Layout
@@ -23,7 +25,10 @@ from vgtm_qp.qp.linearise import Linearisation
 from vgtm_qp.qp.numbers import ClearanceRows, StepNumbers
 from vgtm_qp.qp.residual import InfeasibleStepError
 from vgtm_qp.qp.shape import CurveShape
+from vgtm_qp.qp.solvers import make_solver
 from vgtm_qp.rotation import rotation_from_vector
+from vgtm_qp.step.build import build_arm
+from vgtm_qp.step.engine import GeneralEngine
 from vgtm_qp.step.path import Path
 from vgtm_qp.step.setup import Setup
 from vgtm_qp.step.target import QPInput, Target
@@ -34,6 +39,18 @@ Array = NDArray[np.float64]
 def drives_nothing(patch: pytest.MonkeyPatch) -> None:
     """Let every step of the resolvers made from now on be an attempt, none be taken in one call."""
     patch.setattr("vgtm_qp.step.attempt.can_drive", lambda _: False)
+
+
+def plain_arm(problem: Problem, *, compiled: bool = True) -> Setup:
+    """The arm of a problem with the general engine, which does not step in one call of C; its answers are the same."""
+    setup = build_arm(problem, solves=False)
+
+    def engine(layout: Layout) -> GeneralEngine:
+        solver = make_solver(setup.solver, layout)
+        return GeneralEngine(layout, setup.kinematics, setup.task, solver, compiled=compiled)
+
+    elastic = setup.elastic and cache(lambda: engine(setup.layout.giving_way()))
+    return replace(setup, engine=engine(setup.layout), elastic=elastic)
 
 
 MOVED_BASE = Pose(np.array([0.01, 0.0, 0.02]), rotation_from_vector([0.01, -0.02, 0.015]))

@@ -64,7 +64,7 @@ def test_nobody_is_warned_of_a_curve_that_is_freer_than_the_arm(case):
 def test_ten_bays_go_round_a_cube_that_they_would_enter():
     problem = vq.load_problem("ten_bay_round_a_cube")
     heedless = vq.solve(problem.replace({"obstacle": []}), verify=False)
-    setup = build_arm(problem, compiled=False)
+    setup = build_arm(problem, solves=False)
     assert min(setup.least_clearance(nodes, 0.0, "obstacles") for nodes in heedless.nodes) == -0.03
     for changes in ({}, {"method.solver": "osqp"}, {"method.tracking": "none"}):
         maneuver = vq.solve(problem.replace({**changes, "method.retries": False}))

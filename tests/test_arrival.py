@@ -33,7 +33,7 @@ def layout_of(name, **changes):
     module, bays, vertices, more = ARMS[name]
     truss, curve = {"module": module, "stroke": None}, {"control_vertices": vertices, **changes}
     problem = arm_problem((0.5, 0.2, 2.5), bays=bays, truss=truss, curve=curve, **more)
-    return build_arm(problem, compiled=False).layout
+    return build_arm(problem, solves=False).layout
 
 
 def near_home(layout, rng, size):
@@ -97,7 +97,7 @@ def test_a_curve_reverses_against_the_base_wherever_that_is(base):
 
 
 def test_an_arm_without_a_curve_has_no_end_and_no_gap():
-    layout = build_arm(arm_problem(method={"tracking": "none"}), compiled=False).layout
+    layout = build_arm(arm_problem(method={"tracking": "none"}), solves=False).layout
     nothing, arrival = np.zeros((0, 3)), Arrival(layout)
     assert arrival.ended(nothing, np.zeros(3), np.eye(3)) == (nothing, False)
     assert np.isnan(arrival.gap(layout.arm.home, nothing, np.zeros(0), None))
@@ -130,7 +130,7 @@ def test_the_code_does_not_grow_with_the_arm():
     sizes = []
     for bays in (10, 100):
         problem = arm_problem(bays=bays, truss={"stroke": None}, curve={"control_vertices": 5})
-        layout = build_arm(problem, compiled=False).layout
+        layout = build_arm(problem, solves=False).layout
         functions = ending_function(layout).function, gap_function(layout).function
         sizes.append(sum(len(source_of(function)) for function in functions))
     assert sizes[1] < 1.02 * sizes[0]

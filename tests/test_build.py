@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from steps import solved
+from steps import plain_arm, solved
 
 import vgtm_qp as vq
 from vgtm_qp.methods import QPResolver
-from vgtm_qp.step.build import build_arm
 
 GOAL = [0.1, 0.0, 4.0]
 
@@ -16,7 +15,7 @@ GOAL = [0.1, 0.0, 4.0]
 @pytest.fixture
 def resolver():
     # The answers of an engine that is not one call of C can be read.
-    resolver = QPResolver(build_arm(vq.load_problem("five_bay_two_cubes"), plain=True))
+    resolver = QPResolver(plain_arm(vq.load_problem("five_bay_two_cubes")))
     assert resolver.step(position=[0.05, 0.0, 4.04]).status == "reached"
     return resolver
 

@@ -11,6 +11,7 @@ from arms import arm_problem, make_layout
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from steps import plain_arm
 
 import vgtm_qp as vq
 from vgtm_qp.arm.build import make_arm
@@ -440,7 +441,7 @@ def test_steps_reach_their_goals_keep_their_limits_and_stay_clear(name, solver):
 def test_both_engines_take_the_same_steps(name, hard):
     method = {"tracking_mode": "hard" if hard else "elastic"}
     problem = problem_of(name, method=method, **CLUTTER)
-    fast, plain = vq.Resolver(build_arm(problem)), vq.Resolver(build_arm(problem, compiled=False, plain=True))
+    fast, plain = vq.Resolver(build_arm(problem)), vq.Resolver(plain_arm(problem, compiled=False))
     assert isinstance(fast.setup.engine, FusedEngine)
     assert isinstance(plain.setup.engine, GeneralEngine)
     for _ in range(4):
@@ -774,9 +775,9 @@ def test_a_lock_of_what_an_arm_has_not_names_what_it_has():
 
 def test_stations_of_joints_in_one_place_have_an_attitude():
     problem = vq.load_problem("snake_past_a_cube").replace({"arm.every": 1})
-    stations = build_arm(problem, compiled=False).arm.stations
+    stations = build_arm(problem, solves=False).arm.stations
     assert (
-        (np.diff(stations.centres(build_arm(problem, compiled=False).arm.home), axis=0) == 0.0)
+        (np.diff(stations.centres(build_arm(problem, solves=False).arm.home), axis=0) == 0.0)
         .all(axis=1)
         .any()
     )
@@ -795,7 +796,7 @@ def test_a_locked_joint_is_named_as_one_and_the_key_of_trusses_is_read_too():
     tables = [["p2", {"joint": "y4", "time": 4.0}], [{"member": "p2"}, {"member": "y4", "time": 4.0}]]
     problems = [serial_problem(chain(locked=locked)) for locked in tables]
     assert problems[0] == problems[1] == Problem.from_dict(problems[1].to_dict())
-    assert build_arm(problems[0], compiled=False).jams == (("y4", 4.0),)
+    assert build_arm(problems[0], solves=False).jams == (("y4", 4.0),)
     for wrong, key in (({"joint": "p9"}, "arm.locked[0].joint"), ({"link": "p2"}, "arm.locked[0].link")):
         with pytest.raises(vq.ProblemError) as raised:
             serial_problem(chain(locked=[wrong]))
@@ -813,7 +814,7 @@ def test_a_joint_that_jams_on_the_way_is_held_and_certified():
 
 def test_a_goal_out_of_reach_is_measured_from_the_base_itself():
     problem = serial_problem(chain()).replace({"maneuver.waypoint": [{"time": 1.0, "position": [0, 0, 9]}]})
-    mistakes = check_problem(problem, build_arm(problem, compiled=False))
+    mistakes = check_problem(problem, build_arm(problem, solves=False))
     assert any('from base node "base", all links' in str(mistake) for mistake in mistakes)
 
 

@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from steps import plain_arm
 
 import vgtm_qp as vq
 from vgtm_qp.compiled import compiler, finish_compiling
 from vgtm_qp.geometry.clearance import Clearance
 from vgtm_qp.maneuver.plan import make_plan
-from vgtm_qp.step.build import build_arm
 from vgtm_qp.step.engine import FusedEngine, GeneralEngine
 
 SCENES = [
@@ -42,7 +42,7 @@ def test_both_paths_take_the_same_steps_from_every_state_of_a_maneuver(name, cha
     if changes.get("arm.joint") == "followers":
         changes = {"arm.joint": with_followers(problem)}
     problem = problem.replace(changes)
-    slow = build_arm(problem, compiled=False, plain=True)
+    slow = plain_arm(problem, compiled=False)
     monitor = slow.monitor
     kept = ("safe", "self_safe", "influence", "self_collision")
     options = {key: getattr(monitor, key) for key in kept}

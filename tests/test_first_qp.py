@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import qpsolvers
 from scipy import sparse
+from steps import plain_arm
 
 import vgtm_qp as vq
 from vgtm_qp.maneuver.plan import make_plan
 from vgtm_qp.problem import bundled_problems
 from vgtm_qp.qp.residual import InfeasibleStepError
-from vgtm_qp.step.build import build_arm
 from vgtm_qp.step.chain_engine import ChainEngine
 from vgtm_qp.step.engine import GeneralEngine
 
@@ -93,7 +93,7 @@ def test_other_solvers_give_the_first_answer_of_the_step(name, limit):
     problem = vq.load_problem(name)
     if limit:
         problem = problem.replace({"method.step_limit": limit})
-    resolver = vq.Resolver(build_arm(problem, plain=True))
+    resolver = vq.Resolver(plain_arm(problem))
     plan, compared, task = make_plan(problem, *resolver.tip()), 0, resolver.setup.task
     value = plan.path.start
     for number, mark in enumerate(plan.marks[1:]):

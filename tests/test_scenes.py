@@ -28,7 +28,7 @@ def test_a_scene_is_the_same_each_time_and_its_goal_is_a_clear_shape_of_its_arm(
     assert words == words_again
     # The last digits of LAPACK's solutions depend on where in the memory its arrays are.
     np.testing.assert_allclose(values, values_again, rtol=0.0, atol=1e-12)
-    setup = build_arm(scene.problem, compiled=False)
+    setup = build_arm(scene.problem, solves=False)
     states = [setup.arm.home]
     if scene.reachable:
         states.append(scene.shape)
@@ -103,11 +103,11 @@ def test_serial_scenes_have_everything_that_a_problem_may_say_about_serial_arms(
     assert {any(joint.limits is None for joint in scene.arm.joint) for scene in scenes} == {True, False}
     assert varied_scene(3, 0, arms="serial").to_dict() == scenes[0].to_dict()
     for scene in scenes[:8]:
-        setup = build_arm(scene, compiled=False, solves=False)
+        setup = build_arm(scene, solves=False)
         resting = scene.replace(
             {"obstacle": [{**o, "velocity": (0, 0, 0)} for o in scene.to_dict()["obstacle"]]}
         )
-        home = build_arm(resting, compiled=False, solves=False).least_clearance(
+        home = build_arm(resting, solves=False).least_clearance(
             setup.arm.home_configuration, 0.0, "obstacles"
         )
         assert home >= scene.clearance.safe

@@ -98,7 +98,7 @@ GENERAL = [
 
 
 def built(module, bays, curve, method):
-    return build_arm(shaped_problem(module, bays, curve, method=method), compiled=False)
+    return build_arm(shaped_problem(module, bays, curve, method=method), solves=False)
 
 
 def near_home(setup, rng):

@@ -35,8 +35,8 @@ def furthest(before: np.ndarray, after: np.ndarray) -> float:
 @pytest.mark.parametrize("name", ARMS)
 def test_every_arm_keeps_it_and_gets_on(name):
     problem = limited(name, 0.03)
-    resolver = vq.Resolver(build_arm(problem, compiled=False))
-    free = vq.Resolver(build_arm(problem.replace({"method.step_limit": None}), compiled=False))
+    resolver = vq.Resolver(build_arm(problem))
+    free = vq.Resolver(build_arm(problem.replace({"method.step_limit": None})))
     start = resolver.tip()[0]
     goal = {"position": start + np.array([0.3, 0.05, -0.1])}
     if name == "five_bay_two_cubes_pointing":
@@ -57,7 +57,7 @@ def test_every_arm_keeps_it_and_gets_on(name):
 def test_the_null_space_keeps_it_too(limit, pull):
     """A control vertex is drawn away while the tip rests: no piece of path is there to be halved."""
     problem = limited("five_bay_free", limit)
-    resolver = vq.Resolver(build_arm(problem, compiled=False))
+    resolver = vq.Resolver(build_arm(problem))
     tip = resolver.tip()[0]
     resolver.set_control_vertex_goal(3, resolver.state.control_vertices[3] + pull)
     for _ in range(3):
@@ -107,7 +107,7 @@ def test_other_methods_keep_it(method):
 @settings(max_examples=5, deadline=None)
 def test_an_arm_that_brakes_keeps_it(limit):
     problem = limited("five_bay_free", limit, **{"truss.acceleration": 0.5})
-    resolver = vq.Resolver(build_arm(problem, compiled=False))
+    resolver = vq.Resolver(build_arm(problem))
     goal = resolver.tip()[0] + [0.4, 0.0, -0.1]
     moved = 0
     for _ in range(12):

@@ -69,7 +69,7 @@ TRACKED = {
 
 
 def setup_of(arm, **more):
-    return build_arm(Problem.from_dict({"arm": ARMS[arm], "maneuver": MANEUVER} | more), compiled=False)
+    return build_arm(Problem.from_dict({"arm": ARMS[arm], "maneuver": MANEUVER} | more), solves=False)
 
 
 def bent(setup, rng, size):

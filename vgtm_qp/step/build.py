@@ -57,17 +57,14 @@ _CONDENSED_ALL_THE_SAME = (
 def build_arm(
     problem: Problem,
     *,
-    compiled: bool = True,
-    plain: bool = False,
     solves: bool = True,
     objectives: Sequence[Objective] = (),
     rows: Sequence[Inequality] = (),
 ) -> Setup:
-    """Return the arm of a problem, ready to move; without `compiled` it is built faster and steps more slowly.
+    """Return the arm of a problem, ready to move.
 
-    A `plain` arm does not step in one call of C; its answers are the same. If the caller never `solves` a QP,
-    it gets the engine that is built fastest. `objectives` and `rows` of the user's own are for the QP of a
-    whole arm.
+    If the caller never `solves` a QP, it gets the engine that is built fastest. `objectives` and `rows` of the user's
+    own are for the QP of a whole arm.
 
     Raises
     ------
@@ -98,13 +95,12 @@ def build_arm(
         "unit": arm.unit,
     }
     if solves:
-        how = {"compiled": compiled, "plain": plain}
         with problem.blaming(("method", "tracking"), '"coupled" or "none"'):
-            engine = make_engine(solver, home.layout, kinematics, task, tracking, **how)
+            engine = make_engine(solver, home.layout, kinematics, task, tracking)
     else:
         engine = GeneralEngine(home.layout, kinematics, task, CondensedSolver(home.layout), compiled=False)
     gives_way = home.layout.hard_tracking and problem.method.gives_way
-    elastic = elastic_engine(solver, home.layout, kinematics, task, plain=plain) if gives_way else None
+    elastic = elastic_engine(solver, home.layout, kinematics, task) if gives_way else None
     monitor = Clearance(arm.bodies, self_collision=clearance.self_collision, **options)
     return Setup(
         arm=arm,
@@ -274,11 +270,10 @@ def make_engine(
     tracking: str = "coupled",
     *,
     compiled: bool = True,
-    plain: bool = False,
 ) -> Engine:
     """Return the engine for the steps of an arm: with the QP solver of that name, or by its bays.
 
-    `compiled` and `plain` are as for :func:`build_arm`.
+    Without `compiled` it is built faster, and steps more slowly.
 
     Raises
     ------
@@ -291,7 +286,7 @@ def make_engine(
     is_short = _is_short(layout)
     if layout.elastic_tip and not is_short:
         _LOG.warning(_CONDENSED_ALL_THE_SAME)
-    is_quick = not plain and not layout.own
+    is_quick = not layout.own
     is_long = is_quick and compiled and prefers_sweeps(layout)
     along = chain_solver(layout, dense_solver(solver)) if is_long else None
     if along is not None and ChainEngine.serves(along):
@@ -310,14 +305,12 @@ def make_engine(
 
 
 def elastic_engine(
-    solver: str, layout: Layout, kinematics: Kinematics, task: TipTask, *, plain: bool = False
+    solver: str, layout: Layout, kinematics: Kinematics, task: TipTask
 ) -> Callable[[], Engine]:
     """Return a function that gives the engine for ``Layout.giving_way``; the first call builds it."""
     # The engine of a long arm is seldom needed, and built faster without compiling.
     is_short = _is_short(layout)
-    return cache(
-        lambda: make_engine(solver, layout.giving_way(), kinematics, task, compiled=is_short, plain=plain)
-    )
+    return cache(lambda: make_engine(solver, layout.giving_way(), kinematics, task, compiled=is_short))
 
 
 def _is_short(layout: Layout) -> bool:

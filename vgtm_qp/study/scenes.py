@@ -54,7 +54,7 @@ def random_scene(seed: int, number: int, *, steps: int = 30) -> RandomScene:
         "clearance": {"safe": SAFE, "influence": 0.5},
     }
     # Compiled while scenes are drawn, its kernels would change their last digits.
-    setup = build_arm(Problem.from_dict(problem), compiled=False, solves=False)
+    setup = build_arm(Problem.from_dict(problem), solves=False)
     shape = random_shape(setup, random)
     setup.kinematics.evaluate(shape if reachable else setup.arm.home)
     position, pointing = setup.arm.end_effector.position(shape), setup.kinematics.tip_rotation[:, 2]

@@ -69,7 +69,7 @@ def _scene(random: np.random.Generator, name: str, steps: int) -> Problem:
     states = [home, shape] if reachable else [home]
     data["obstacle"] = _cubes(arm, random, states, int(random.integers(1, 9)))
     problem = Problem.from_dict(data)
-    build_arm(problem, compiled=False, solves=False)
+    build_arm(problem, solves=False)
     return problem
 
 
