@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 
 from vgtm_qp.rows.members import (
     LengthScatter,
-    end_function,
     fixed_error,
     joint_frames,
     length_nodes,
     length_rhs,
+    member_end_function,
     member_ends,
     member_function,
 )
@@ -61,7 +61,7 @@ def test_ends_in_symbols_are_those_in_arrays_and_their_jacobians_the_derivatives
     np.testing.assert_allclose(np.swapaxes(frames, 1, 2) @ frames, np.tile(np.eye(3), (4, 1, 1)), atol=1e-13)
     normal = np.cross(X[TRIANGLE[:, 1]] - X, X[TRIANGLE[:, 2]] - X)
     assert (np.einsum("nc,nc->n", frames[:, :, 2], normal) > 0.0).all()
-    wanted, function = ends_of(X, offset), end_function()
+    wanted, function = ends_of(X, offset), member_end_function()
     for member, end in np.ndindex(len(MEMBERS), 2):
         corners = X[TRIANGLE[MEMBERS[member, end]]]
         found, jacobian = function(corners.T, offset[member, end])

@@ -542,7 +542,7 @@ class Kinematics:
 
     @cached_property
     def _tip_alone(self) -> Kernel:
-        kernel = tip_function(self._arm).kernel(compiled=self._compiled)
+        kernel = tip_frame_function(self._arm).kernel(compiled=self._compiled)
         for k in range(2):
             kernel.bind_output(k, self._kernel.outputs[2 + k])
         return kernel
@@ -565,7 +565,7 @@ class Kinematics:
         return self._arm.motion_rows(self._motion.copy(), np.zeros(3 * len(self._arm.free)))
 
 
-def tip_function(arm: Arm) -> Bound:
+def tip_frame_function(arm: Arm) -> Bound:
     """Return the function from the tip's nodes (3, K) to its rotation (3, 3) and spin (3, 3K); the tip has a frame."""
     constants, tip = Constants(), arm.end_effector
     nodes = ca.MX.sym("nodes", 3, len(tip.nodes))

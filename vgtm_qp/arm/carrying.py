@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from vgtm_qp.arm.arm import Approach, Arm, between, tip_function
+from vgtm_qp.arm.arm import Approach, Arm, between, tip_frame_function
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.geometry.bodies import lengthened
 from vgtm_qp.geometry.shapes import Obstacle
@@ -164,7 +164,7 @@ class _TipFrame:
     """The end effector's frame, by its nodes alone."""
 
     def __init__(self, arm: Arm) -> None:
-        self._tip, self._kernel = arm.end_effector, tip_function(arm).kernel(compiled=False)
+        self._tip, self._kernel = arm.end_effector, tip_frame_function(arm).kernel(compiled=False)
 
     def at(self, X: Array) -> tuple[Array, Array, Array]:
         """Return position (3,), m, rotation (3, 3) and spin (3, 3K) for nodes at `X` (N, 3), m."""

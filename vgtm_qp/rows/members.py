@@ -55,7 +55,7 @@ def member_function(*, has_offsets: bool) -> ca.Function:
     return ca.Function("member", [nodes, offsets], [found, ca.gradient(found, nodes)])
 
 
-def end_function() -> ca.Function:
+def member_end_function() -> ca.Function:
     """Return (corners (3, 3), offset (3,)) -> a member's end (3,) and its Jacobian (3, 9), eqs. (20) and (21)."""
     corners, offset = ca.SX.sym("corners", 3, 3), ca.SX.sym("offset", 3)
     end = member_end(corners, offset)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from vgtm_qp.arm.arm import Arithmetic, Arm, Ends, tip_function
+from vgtm_qp.arm.arm import Arithmetic, Arm, Ends, tip_frame_function
 from vgtm_qp.arrays import Array
 from vgtm_qp.geometry.exact import CONTACT, NORMAL_FROM, PROOF
 from vgtm_qp.geometry.groups import Scene
@@ -89,7 +89,7 @@ class StepData:
         kernels = {"place": known.place, "bend": known.bend, "levers": known.levers}
         self.program.set(**{name: value for name, value in kernels.items() if value is not None})
         if setup.task.turns is not None:
-            self.program.set(frame=tip_function(arm).kernel())
+            self.program.set(frame=tip_frame_function(arm).kernel())
         of_points = {"points": self.before[self.parts[1]], "next_points": self.after[self.parts[1]]}
         of_points |= _of_points(arm, known.ends)
         self.points: Array | None = None if known.ends is None else of_points["points"]

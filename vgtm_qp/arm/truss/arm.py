@@ -32,7 +32,7 @@ from vgtm_qp.arrays import Array, Index
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.errors import TrussError
 from vgtm_qp.geometry.bodies import capsules
-from vgtm_qp.rows.members import end_function
+from vgtm_qp.rows.members import member_end_function
 
 
 class TrussArm(Arm):
@@ -84,7 +84,7 @@ class TrussArm(Arm):
         bend, ends = None, None
         if truss.joints is not None:
             nodes, offset = truss.joints.triangle[truss.members], truss.joints.offset
-            kernels = place_function(truss).kernel(), Kernel(end_function())
+            kernels = place_function(truss).kernel(), Kernel(member_end_function())
             ends = Ends(*kernels, nodes.reshape(-1, 3), offset.reshape(-1, 3))
             bend = bend_function(truss).kernel()
         lengths = True, self._first, self._last, np.zeros(len(self._first))

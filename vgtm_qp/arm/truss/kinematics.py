@@ -14,7 +14,7 @@ from vgtm_qp.arm.truss.truss import Truss
 from vgtm_qp.arrays import Array, Index
 from vgtm_qp.compiled import Kernel
 from vgtm_qp.errors import SolverError
-from vgtm_qp.rows.members import end_function, member_end, member_function
+from vgtm_qp.rows.members import member_end, member_end_function, member_function
 
 _DENSE = 150
 """Greatest number of node coordinates for which dense LAPACK is faster than a sparse factorisation."""
@@ -56,7 +56,7 @@ class EndKinematics:
 
     def __init__(self, members: Index, joints: Joints) -> None:
         self.nodes = joints.triangle[members]
-        self._kernel = Kernel(end_function().map(2 * len(members)))
+        self._kernel = Kernel(member_end_function().map(2 * len(members)))
         self._kernel.inputs[1][:] = joints.offset.reshape(-1)
         self.jacobian = self._kernel.outputs[1].reshape(-1, 2, 9, 3).transpose(0, 1, 3, 2)
 
