@@ -48,12 +48,32 @@ def of_the_package() -> Iterator[tuple[str, Definition]]:
         )
 
 
+def aliases(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """Yield line and name of what a module calls like a class, without making one: type aliases."""
+    for node in tree.body:
+        targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
+        for target in targets:
+            if isinstance(target, ast.Name) and re.fullmatch(
+                "_?[A-Z][A-Za-z0-9]*[a-z][A-Za-z0-9]*", target.id
+            ):
+                yield node.lineno, target.id
+
+
 def test_a_class_name_stands_for_one_class() -> None:
+    """Nor does a type alias share the name of a class, or of another alias."""
     homes = defaultdict(list)
     for place, node in of_the_package():
         if isinstance(node, ast.ClassDef):
             homes[node.name].append(place)
+    for file in sorted(PACKAGE.rglob("*.py")):
+        for line, name in aliases(ast.parse(file.read_text(encoding="utf-8"))):
+            homes[name].append(f"{file.relative_to(PACKAGE).as_posix()}:{line} {name}")
     assert not {name: places for name, places in homes.items() if len(places) > 1}
+
+
+def test_type_aliases_are_found() -> None:
+    text = "Box = tuple[int, int]\nNear: TypeAlias = int\nMOST = 3\n_T = 1\nclass Pair: ...\n_Shape = int\n"
+    assert [name for _, name in aliases(ast.parse(text))] == ["Box", "Near", "_Shape"]
 
 
 def too_long(node: Definition) -> bool:

@@ -16,7 +16,7 @@ from vgtm_qp.qp.dense import DenseSolver
 from vgtm_qp.qp.long.chain_data import ChainData
 from vgtm_qp.qp.long.elimination import Elimination
 from vgtm_qp.qp.long.sweep import ChainClosing
-from vgtm_qp.qp.long.working_set import Answer, Key, Moved, RowTable, solve_rows
+from vgtm_qp.qp.long.working_set import Answer, DisplacementsAt, Key, RowTable, solve_rows
 from vgtm_qp.qp.numbers import RowNumbers, StepNumbers, beyond, norm
 from vgtm_qp.qp.residual import loose, refuse_large, relative
 
@@ -162,7 +162,7 @@ class ChainSolver(ABC):
         """Return (size, R) L^-1 A' of rows A: nodes (R, Q), coefficients (R, Q, 3), and over the curve (R, 3V - 5)."""
 
     @abstractmethod
-    def _least(self, combined: Array) -> tuple[Moved, Array, Array]:
+    def _least(self, combined: Array) -> tuple[DisplacementsAt, Array, Array]:
         """Minimise the Lagrangian, given columns times multipliers (size,).
 
         Return the nodes' displacements and the changes of actuated (n_a,) and locked (l,) members at the minimum.

@@ -19,7 +19,7 @@ from vgtm_qp.qp.long.chain import Chain
 from vgtm_qp.qp.long.elimination import Elimination
 from vgtm_qp.qp.long.solver import SINGULAR, ChainSolver
 from vgtm_qp.qp.long.sweep import ChainClosing, Sweep
-from vgtm_qp.qp.long.working_set import BLOCK, Moved
+from vgtm_qp.qp.long.working_set import BLOCK, DisplacementsAt
 from vgtm_qp.qp.settle import WORST_CONDITION
 
 
@@ -122,7 +122,7 @@ class StagedSolver(ChainSolver):
             columns[self._freedom :] = -dtrtrs(self._curve_factor, through, lower=1)[0]
         return columns
 
-    def _least(self, combined: Array) -> tuple[Moved, Array, Array]:
+    def _least(self, combined: Array) -> tuple[DisplacementsAt, Array, Array]:
         motions = self._outer[:, -1] + combined[: self._freedom]
         if self._curve:
             known = self._curve_rhs + combined[self._freedom :]

@@ -19,7 +19,7 @@ from vgtm_qp.qp.long.elimination import Elimination
 from vgtm_qp.qp.long.solver import SINGULAR, ChainSolver
 from vgtm_qp.qp.long.sparse_symbols import dense_function, nonzeros, small_inverse, symbols_like
 from vgtm_qp.qp.long.sweep import ChainClosing, Sweep
-from vgtm_qp.qp.long.working_set import Moved
+from vgtm_qp.qp.long.working_set import DisplacementsAt
 
 
 class Following:
@@ -136,7 +136,7 @@ class TrackedSolver(ChainSolver):
         rows = np.einsum("rqc,rqcn->nr", coefficients, moved[..., :-1]) + curve.T
         return np.asarray(dtrtrs(self._factor, rows, lower=1)[0])
 
-    def _least(self, combined: Array) -> tuple[Moved, Array, Array]:
+    def _least(self, combined: Array) -> tuple[DisplacementsAt, Array, Array]:
         self._free = -dtrtrs(self._factor, self._rhs + combined, lower=1, trans=1)[0]
         self._one[:-1] = self._free
         return self._moved_by, (self._strokes @ self._one).take(self._among_actuated), np.zeros(0)

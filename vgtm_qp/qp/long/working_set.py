@@ -37,7 +37,7 @@ MemberRows = Callable[[Index], tuple[Index, Array]]
 Key = int | bytes
 """Key of a row from QP to QP: its number, or the nodes of a clearance row."""
 
-Moved = Callable[[Index], Array]
+DisplacementsAt = Callable[[Index], Array]
 """Displacements (..., 3), m, of nodes (...,)."""
 
 
@@ -83,7 +83,9 @@ class RowTable:
         none = np.full(len(end.rhs) + 1 + len(legs), -1)
         self._members = np.concatenate([locked, none, layout.arm.actuators])
 
-    def values(self, moved: Moved, strokes: Array, held: Array, curve: Array, progress: float) -> Array:
+    def values(
+        self, moved: DisplacementsAt, strokes: Array, held: Array, curve: Array, progress: float
+    ) -> Array:
         """Return (total,) row values at displacements of the nodes.
 
         `strokes` (n_a,) and `held` (l,) are the changes of the actuated and of the locked members' lengths, `curve`
