@@ -75,9 +75,7 @@ def noting_interrupts(noted: threading.Event) -> Iterator[None]:
 
 
 def machine_record() -> dict[str, Any]:
-    """Return as JSON data: processor, cores, load, system, Python and C compiler."""
-    from vgtm_qp.compiled import compiler
-
+    """Return as JSON data: processor, cores, load, system and Python."""
     return {
         "processor": _processor(),
         "cores": os.cpu_count(),
@@ -85,7 +83,6 @@ def machine_record() -> dict[str, Any]:
         "load": [round(value, 2) for value in os.getloadavg()] if hasattr(os, "getloadavg") else [],
         "system": platform.platform(),
         "python": platform.python_version(),
-        "compiler": compiler(),
     }
 
 

@@ -18,6 +18,7 @@ from vgtm_qp.bench.measure import breakdown, run_alone, run_in_turn, timing
 from vgtm_qp.bench.scenes import BenchScene
 from vgtm_qp.bench.tour import Goal, make_goals
 from vgtm_qp.comparison.tables import exponent
+from vgtm_qp.compiled import compiler
 from vgtm_qp.errors import ResultError, VgtmError
 from vgtm_qp.machine import commit, machine_record, versions
 from vgtm_qp.methods import Resolver
@@ -127,7 +128,7 @@ def measure(
         "schema_version": SCHEMA_VERSION,
         "time": datetime.now(UTC).isoformat(timespec="seconds"),
         "commit": commit(),
-        "machine": machine_record(),
+        "machine": machine_record() | {"compiler": compiler()},
         "versions": versions(_PACKAGES + _PEERS),
         "settings": {"seconds": seconds, "steps": steps, "cold": cold, "one_blas_thread": pinned},
         "baselines": {name: BASELINES[name].title for name in names},
