@@ -108,13 +108,12 @@ class Log:
             self._rows.setdefault(name, []).append(value)
 
     def maneuver(
-        self, problem: Problem, stop: Stop | None = None, *, whole: float = 1.0, **told: Any
+        self, problem: Problem, stop: Stop | None = None, *, whole: float = 1.0, **entries: Any
     ) -> Maneuver:
         """Return the rows as the maneuver of a problem, not certified yet.
 
-        `whole` is the progress at the end of the path. `told` has the other keys of the manifest, see
-        ``result.manifest``: digests of the problem's files, the retry that led out of a dead end, and the time of the
-        set-up.
+        `whole` is the progress at the end of the path. `entries` are added to the manifest, see ``result.manifest``:
+        digests of the problem's files, the retry that led out of a dead end, and the time of the set-up.
         """
         resolver, setup, first = self._resolver, self._resolver.setup, self._scenes[0]
         scenes = self._scenes if self._begins_otherwise else self._scenes[1:]
@@ -145,7 +144,7 @@ class Log:
             "jacobian_rank": resolver.rank,
             "clearance_rows": self._clearance_rows,
             **({"own": own.record(np.asarray(self._rows["configuration"]))} if own else {}),
-            **told,
+            **entries,
         }
         arrays: dict[str, Any] = {name: np.asarray(rows, dtype=float) for name, rows in self._rows.items()}
         arrays["progress"] /= whole
