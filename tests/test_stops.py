@@ -84,6 +84,20 @@ def test_the_wall_is_named_and_the_set_is_small():
     json.dumps(maneuver.manifest, allow_nan=False)
 
 
+@pytest.mark.parametrize("name", ["east / wall", "wall: its upper part", "member L2-1 / wall"])
+def test_an_obstacle_is_named_whatever_its_name_contains(name):
+    """Names of rows have colons and slashes too, and the name of an obstacle may end with that of another."""
+    wall = {"name": name, "shape": "box", "center": [1.3, 0.0, 2.5], "size": [0.2, 8.0, 8.0]}
+    away = {"name": "wall", "shape": "box", "center": [-9.0, 0.0, 2.5], "size": 0.2}
+    problem = vq.load_problem("five_bay_blocked_by_wall")
+    stop = vq.solve(problem.replace({"obstacle": [away, wall], "method.retries": False})).manifest["stop"]
+    assert (stop["kind"], stop["obstacles"]) == ("obstacle", [name])
+    changed = {
+        change["name"] for remedy in stop["remedies"] for change in remedy if change["kind"] == "clearance"
+    }
+    assert changed == {name}
+
+
 @pytest.mark.smoke
 def test_a_stretched_arm_is_out_of_reach_of_what_lies_further():
     waypoint = [{"time": 4.0, "position": [0.0, 0.0, 2.62]}]

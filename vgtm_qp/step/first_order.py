@@ -217,8 +217,16 @@ def _linear_program(
 
 
 def obstacle_of(setup: Setup, name: str) -> str:
-    """Return the name of the obstacle in the name of a row; empty if there is none."""
-    return next((o.name for o in setup.monitor.obstacles if name.endswith(f" / {o.name}")), "")
+    """Return the obstacle of the row of that name, as ``PairNames.clearance`` makes it; empty if there is none.
+
+    What stands before the obstacle has to be a body of the arm, as the name of one obstacle may end with another's.
+    """
+    bodies = setup.monitor.bodies.names
+    for obstacle in setup.monitor.obstacles:
+        row, end = name.removeprefix(f"{CLEARANCE}: "), f" / {obstacle.name}"
+        if row.endswith(end) and row.removesuffix(end).partition(" ")[2] in bodies:
+            return obstacle.name
+    return ""
 
 
 def limit_of(setup: Setup, row: str, upper: bool) -> Limit | None:
