@@ -8,8 +8,8 @@ reference curve, and the last station is the end effector.
 An arm is moved by its *quantities* [c; a]: fixed ones, c(q) = const, and actuated ones a(q), which have
 boxes. There are as many quantities as coordinates of q, so that to first order the nodes move by K d_a + r.
 
-Rows, QPs and steps know nothing else of an arm. Outside the folder ``arm`` the methods that move the curve first ask
-for its kind.
+Rows and steps know no more of an arm than this. What goes along a truss is for arms with ``bays``, which a serial arm
+has not: the eliminations of ``qp/bays.py`` and ``qp/long``. The resolvers in ``methods`` also ask for an arm's class.
 """
 
 from __future__ import annotations

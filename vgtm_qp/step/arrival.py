@@ -48,8 +48,8 @@ def traced_shape(layout: Layout) -> CurveShape | None:
 def gap_function(layout: Layout) -> Bound:
     """Return (X (3, N), vertices (3, V)) -> the greatest gap of a station, m, or turn, times the arm's unit.
 
-    Turns count if they are equalities. NaN stays. If there is a :func:`traced_shape`, so are two more arguments:
-    ``position`` and ``frame`` of ``CurveRows``, transposed as CasADi reads them.
+    Turns count if they are equalities. If one of the gaps is NaN, so is the greatest. With a :func:`traced_shape` the
+    function has two arguments more: ``position`` and ``frame`` of ``CurveRows``, transposed as CasADi reads them.
     """
     constants, arm, tracked = Constants(), layout.arm, layout.tracked
     count, nodes = len(tracked), arm.stations.nodes[tracked]

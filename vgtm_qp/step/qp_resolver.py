@@ -222,7 +222,7 @@ class QPResolver(Resolver, serves="qp"):
     def relaxed(self, remedy: Remedy) -> QPResolver:
         """See :class:`Resolver`."""
         other = QPResolver(relaxed(self.setup, remedy.changes))
-        # Locks hold what they find.
+        # The state comes first: a lock holds an actuator at the value it has.
         other.state = replace(self.state, shortfall=None)
         for name in self._actuation.locked:
             other.lock(name)

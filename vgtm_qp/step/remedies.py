@@ -286,7 +286,7 @@ def relaxed(setup: Setup, changes: Sequence[Change]) -> Setup:
         "unit": setup.arm.unit,
     }
     monitor = Clearance(before.bodies, obstacles, self_collision=before.self_collision, **options)
-    # What the one takes up the other does not.
+    # A copy: from now on each of the two arms takes up and releases bodies by itself.
     carrier = copy.copy(setup.carrier)
     return replace(
         setup,

@@ -227,8 +227,8 @@ class Resolver(ChangingScene):
     ) -> StepQP:
         """Return the first QP of a step to a goal, to read, to print or to solve elsewhere; nothing moves.
 
-        Every row and column has a name, a kind and a unit. The step solves this QP, or an equivalent condensed one.
-        Parameters and errors are those of :meth:`step`; GoalError also if the method solves no QP.
+        Rows and columns have names, kinds and units. It is assembled anew for reading, equal to the QP that the step
+        solves condensed. Parameters and errors are those of :meth:`step`; GoalError also if the method solves no QP.
         """
         self._refuse("show the QP of a step, since it solves none")
 
@@ -300,7 +300,7 @@ class Resolver(ChangingScene):
         return Stop(StopKind.NONLINEAR, dict.fromkeys(last.blocked_by, 0.0), reason=last.reason)
 
     def _after_change(self) -> NamedShortfall:
-        """See :class:`ChangingScene`; a method without rows drives no pair apart, but tells."""
+        """See :class:`ChangingScene`; a method without rows reports pairs that are too near, and drives none apart."""
         setup, state = self.setup, self.state
         near = setup.monitor.near(
             setup.carrier.points(state.q), state.time, setup.safe, self_reach=setup.self_safe

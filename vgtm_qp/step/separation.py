@@ -93,10 +93,9 @@ class Separation:
     ) -> tuple[BetweenReport, Shortfall | None]:
         """Return the proof of :meth:`between` for the motion to `q`, and the pairs that are too near there.
 
-        The pairs are None if one of them was not too near `before`, or came nearer, or an angle or a row of the user's
-        own is not kept. The proof covers the end
-        of the motion, unless points leave their chords: it then allows a little less clearance than a state
-        must have.
+        The pairs are None where `q` is refused: a pair is too near that was not so `before`, or that came nearer; or an
+        angle is too small; or a row of the user's own is not kept. Where points leave their chords, the proof allows a
+        little less clearance than a state must have, and the end of the motion is checked by itself.
         """
         report = self.between(state.q, q, state.time, time, before)
         if not self._angles_hold(q) or not (self._own is None or self._own.hold(q)):

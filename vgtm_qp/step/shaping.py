@@ -24,7 +24,7 @@ from vgtm_qp.step.task import vector
 
 
 class Shaping:
-    """Keeps the setup of each curve that an arm has had.
+    """Keeps the setup of each curve that an arm has had, and the goals of control vertices; makes targets of both.
 
     Attributes
     ----------

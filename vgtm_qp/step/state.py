@@ -58,8 +58,8 @@ class State:
     tip : Pose or None
         Pose of the end effector; None if not computed yet.
     late : float
-        Duration that `time` lacks by rounding, s. A large clock cannot show a short step, but the sum of
-        many.
+        What rounding left out of `time`, s: the exact time is their sum. Otherwise steps too short for the digits of a
+        large `time` would be lost, however many there are.
     """
 
     time: float

@@ -185,7 +185,10 @@ class Step:
 
     @property
     def fcl_rows(self) -> int:
-        """Number of clearance rows in the QP that moved the arm by FCL, each proven; all that press, if it is asked."""
+        """Number of rows that FCL supplied to the QP that moved the arm, each proven.
+
+        Where FCL is asked for the rows that press alone, others do not count.
+        """
         return 0 if self.rows is None else self.rows.by_fcl
 
     @property
