@@ -11,9 +11,12 @@ from vgtm_qp.problem.method import Weights
 from vgtm_qp.step.setup import Setup
 
 DEFAULT_TERMS = ("actuator_rate",)
-"""Weight of node displacements beside other terms; without it the battens of long arms collapse."""
+"""Terms of a problem that names none."""
 
 _TRACE = 1e-6
+"""Weight of the nodes' displacements over that of the actuators', if no term weighs them: else battens of long arms
+collapse.
+"""
 _NEAREST = 0.05
 """Share of the influence distance below which the potential's slope is constant, so that a step stays finite."""
 
