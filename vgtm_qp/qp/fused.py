@@ -45,7 +45,8 @@ SUMS = 16
 """Numbers of ``qp.c`` that sum up the nodes which an actuator moves."""
 
 _SMALL_ERROR, _TINY_ERROR = 3e-6, 1e-11
-"""Errors of a quantity, over the arm's unit, of which one step of Newton's method leaves next to nothing, and nothing.
+"""Errors of a quantity, over the arm's unit. Of one below the first, a step of Newton's method leaves so little that
+the equalities can be measured after it; of one below the second, rounding alone.
 """
 
 

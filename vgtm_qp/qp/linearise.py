@@ -161,10 +161,14 @@ class Linearisation:
 def linear_function(layout: Layout) -> Bound:
     """Return the function that linearises a step of `layout`.
 
-    Arguments are ``StepGraph.inputs``. Results: quantities (M,), strokes (n_a,); tip error, rate (n_e,) and J_u
-    (n_e, 3K); curvature of the progress; offsets (3, V) and base axes (3, 2) of the curve; rows (3 V, G) and bounds (G)
-    of its legs; and, one block a tracked station, gaps (3, K), turns (R, K), their rows over the stations' nodes
-    (R, 9 K) and over the curve (``StationSymbols.curve``); last, the values of ``Arm.motion_rows``.
+    Arguments are ``StepGraph.inputs``. Results, in this order:
+
+    - quantities (M,) and strokes (n_a,);
+    - error (n_e,) and rate (n_e,) of the tip, its Jacobian J_u (n_e, 3K) over its K nodes; curvature of the progress;
+    - offsets (3, V) and base axes (3, 2) of the curve; rows (3 V, G) and bounds (G) of its legs;
+    - gaps (3, S) and turns (R, S) of the S tracked stations; the turns' rows over the stations' nodes (R, 9S) and over
+      the curve (``StationSymbols.curve``);
+    - the values of ``Arm.motion_rows``.
     """
     constants = Constants()
     graph = StepGraph(layout, layout.arm.symbols(constants), constants)

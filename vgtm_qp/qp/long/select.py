@@ -38,6 +38,6 @@ def prefers_staged(layout: Layout) -> bool:
 def prefers_sweeps(layout: Layout) -> bool:
     """Whether whole steps by a `chain_solver`, if there is one, are faster than by the condensed QP.
 
-    A compiler makes no difference, for the two settle to different states.
+    The answer is the same with and without a compiler, since the two settle to different states.
     """
     return len(layout.arm.actuators) >= SWEPT_ACTUATORS and layout.is_tabled
