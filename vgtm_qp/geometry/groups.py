@@ -328,7 +328,7 @@ class Group:
         return order[np.sort(np.unique(like[order], axis=0, return_index=True)[1])]
 
     def contacts(self, X: Array, time: float, rows: Index, found: Array, by_fcl: bool) -> Found:
-        """Return the contacts `found` (R, 2 E + 5) of the pairs `rows`; if `by_fcl`, replaced by FCL's.
+        """Return the contacts `found` (R, 2 E + 5) of the pairs `rows`; if `by_fcl`, FCL's overwrite them in place.
 
         For a pair with two contacts FCL is given the two points of the body. A contact stays as it was found if the
         axes touch or FCL's answer is not proven, see ``proof_function``.

@@ -245,7 +245,15 @@ class Watch:
         return way
 
     def _answered(self, name: str, *arguments: float) -> Code:
-        """Call C with enough room, and return its code; raise where a position is not finite or a pair has no value."""
+        """Call a function of C, again with more room where it lacked some, and return its code.
+
+        Raises
+        ------
+        GeometryError
+            A position is not a finite number.
+        EvaluationError
+            The distance of a pair has no value.
+        """
         assert self._way is not None
         while (code := self._way.call(name, *arguments)) is Code.FULL:
             self.make_room()
@@ -256,7 +264,7 @@ class Watch:
         return code
 
     def _clock(self, time: float) -> float:
-        """Return the time that tells where pieces are: zero where they rest, else `time`, s."""
+        """Return `time`, s, if pieces of obstacles move; else zero, since places at rest are the same at all times."""
         return time if self._scene.pieces.moving else 0.0
 
     def refresh(self) -> None:
@@ -269,14 +277,14 @@ class Watch:
         assert self._way is not None
         larger = next((pairs for pairs in self._groups if pairs.make_room()), None)
         if larger is not None:
-            # It may have been full by chance, and another one be short.
+            # What was listed is forgotten, so that C lists it anew. If another group lacks room, the next call says so.
             self._way.set(**{"self_far" if larger.is_self else "far": -np.inf})
             return
         room = 2 * self._way.data.neighbour_room
         self._way.set(neighbour=np.zeros(room, dtype=np.int32), neighbour_room=room)
 
     def started(self, X: Array) -> Program:
-        """Return the ``Way`` of C, which begins at positions `X` (P, 3)."""
+        """Return C's ``Way``, made at the first call for bodies at positions `X` (P, 3), m."""
         if self._way is not None:
             return self._way
         bodies, parts, self._place = self._scene.bodies, Division(self._scene.bodies, X), X.copy()
