@@ -345,9 +345,9 @@ class Attempt:
 def _beginning(
     begin: QPInput | Begun, target: Target
 ) -> tuple[Move | None, ClearanceRows | None, float, Target, int]:
-    """Return the first answer and its rows; then the share of the piece that the next QP is for, its target and number.
+    """Return the first answer and its rows, or None, and of the next QP the share of the piece, the target and number.
 
-    The next one of a beginning is that whose answer is there already.
+    After a ``Begun`` step the next QP is its last one, whose answer is known: it is not solved again.
     """
     if not isinstance(begin, Begun):
         return None, None, 1.0, target, 1
