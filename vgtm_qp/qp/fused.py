@@ -25,6 +25,7 @@ from vgtm_qp.qp.curve_rows import curve_function, point_function
 from vgtm_qp.qp.daqp import DAQP, Daqp
 from vgtm_qp.qp.dense import EQUALITY, DenseQP, DenseSolver
 from vgtm_qp.qp.fused_rows import RESULTS, row_function
+from vgtm_qp.qp.graph import Argument
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.linearise import StepInput
 from vgtm_qp.qp.numbers import UNBOUNDED, ClearanceRows
@@ -33,6 +34,9 @@ from vgtm_qp.qp.settle import ON_PATH, SETTLING_STEPS, aims, closing_function, m
 from vgtm_qp.qp.shape import CurveRows
 from vgtm_qp.qp.stepper import NearRows
 from vgtm_qp.rows.tip import TipGoal
+
+_POINT = Argument.Q, Argument.VERTICES, Argument.PROGRESS
+"""Where a QP is linearised, beside the torsion of its curve."""
 
 _NOWHERE: Array = np.zeros((0, 3))
 _NO_NUMBERS: Array = np.zeros(0)
@@ -114,7 +118,7 @@ class FusedSolver:
     def point(self) -> tuple[Array, Array, Array, float]:
         """See :class:`~vgtm_qp.qp.stepper.Corrector`."""
         work = self.workspace
-        q, vertices, progress = (work.inputs[k].copy() for k in (0, 3, 7))
+        q, vertices, progress = (work.inputs[k].copy() for k in _POINT)
         torsion = np.zeros(0) if work.curve is None else work.curve.inputs[1].copy()
         return q.reshape(work.shape), vertices.reshape(-1, 3), torsion, float(progress[0])
 
@@ -197,8 +201,8 @@ class FusedSolver:
         work, inputs = self.workspace, self.workspace.condense.inputs
         work.q[:], work.points[:] = q.reshape(-1), curve.vertices.reshape(-1)
         work.torsions[:] = curve.torsion
-        inputs[4][:], inputs[5][:] = lower, upper
-        inputs[8][:], inputs[9][:] = goal.position, goal.rotation.T.reshape(-1)
+        inputs[Argument.LOWER][:], inputs[Argument.UPPER][:] = lower, upper
+        inputs[Argument.GOAL][:], inputs[Argument.TURNED][:] = goal.position, goal.rotation.T.reshape(-1)
         work.gone[0] = 0.0
         if work.check(work.call("settle")) != Code.DONE:
             return None
@@ -399,12 +403,14 @@ class FusedWorkspace:
         """Allocate the arrays, and give their addresses to C."""
         layout, condense, missing, close = self._layout, self.condense, self.missing, self.close
         # Both kernels share their arguments up to the constants, except q, the control vertices and `motion`.
-        own, common = (0, 3, 6), 12 + len(CurveRows._fields) * (layout.general is not None)
+        own = Argument.Q, Argument.VERTICES, Argument.MOTION
+        common = Argument.GIVEN + len(CurveRows._fields) * (layout.general is not None)
         for argument in set(range(common)) - set(own):
             missing.bind_input(argument, condense.inputs[argument])
-        for argument, shared in enumerate((missing.inputs[0], condense.inputs[4], condense.inputs[5])):
+        self.q, self.points, self.gone = (missing.inputs[k] for k in (*own[:2], common))
+        box = condense.inputs[Argument.LOWER], condense.inputs[Argument.UPPER]
+        for argument, shared in enumerate((self.q, *box)):
             close.bind_input(argument, shared)
-        self.q, self.points, self.gone = missing.inputs[0], missing.inputs[3], missing.inputs[common]
         self.started, self.started_points = self.q.copy(), self.points.copy()
         self.torsions, self.started_torsions = np.zeros(layout.torsion), np.zeros(layout.torsion)
         size, nodes = self.size, layout.node_columns
@@ -441,9 +447,9 @@ class FusedWorkspace:
             q=self.q,
             points=self.points,
             gone=self.gone,
-            progress=condense.inputs[7],
-            velocity=condense.inputs[10],
-            spin=condense.inputs[11],
+            progress=condense.inputs[Argument.PROGRESS],
+            velocity=condense.inputs[Argument.VELOCITY],
+            spin=condense.inputs[Argument.SPIN],
             closer=close.outputs[0],
             errors=close.outputs[2],
             torsions=self.torsions,
@@ -465,9 +471,9 @@ class FusedWorkspace:
 
     def _bend(self, curve: Kernel) -> None:
         """Let the functions of the curve write among the arguments of the others, and give them to C."""
-        nodes, inputs = self.curve_nodes, self.condense.inputs[12:]
+        nodes, inputs = self.curve_nodes, self.condense.inputs[Argument.GIVEN :]
         assert nodes is not None
-        curve.bind_input(0, self.condense.inputs[3])
+        curve.bind_input(0, self.condense.inputs[Argument.VERTICES])
         for argument, shared in enumerate((self.points, self.torsions, curve.inputs[2])):
             nodes.bind_input(argument, shared)
         for result, field in enumerate(CurveRows._fields):
@@ -579,8 +585,8 @@ def _composition(layout: Layout, condense: Kernel) -> dict[str, Any]:
     spacings = np.full(layout.spacings, np.sqrt(weights.spacing))
     curve: dict[str, Any] = {}
     if layout.general is not None:
-        points, rows = (12 + CurveRows._fields.index(name) for name in ("position_rows", "spacing_rows"))
-        curve = {"point_rows": condense.inputs[points], "stretch_rows": condense.inputs[rows]}
+        given = CurveRows(*condense.inputs[Argument.GIVEN :][: len(CurveRows._fields)])
+        curve = {"point_rows": given.position_rows, "stretch_rows": given.spacing_rows}
     return {
         "stations": len(tracked),
         "station_node": np.ascontiguousarray(stations.nodes[tracked], dtype=np.int32),

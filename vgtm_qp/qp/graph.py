@@ -15,6 +15,12 @@ from vgtm_qp.rows import tip as tip_rows
 from vgtm_qp.rows import tracking
 
 
+class Argument:
+    """Places of a step's arguments among ``StepGraph.inputs``; those of a general curve begin at GIVEN."""
+
+    Q, AT, BASE, VERTICES, LOWER, UPPER, MOTION, PROGRESS, GOAL, TURNED, VELOCITY, SPIN, GIVEN = range(13)
+
+
 class StepGraph:
     """Arguments of a step, and the rows that follow from them.
 
@@ -71,7 +77,7 @@ class StepGraph:
 
     @property
     def inputs(self) -> list[ca.MX]:
-        """Arguments of both functions, the constants last."""
+        """Arguments of both functions by :class:`Argument`, the constants last."""
         return [
             *(self.q, self.at, self.base, self.vertices, self.lower, self.upper, self.motion, self.progress),
             *(self.goal, self.turned, self.velocity, self.spin, *self.given, *self._constants.symbols),

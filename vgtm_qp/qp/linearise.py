@@ -9,7 +9,7 @@ import numpy as np
 from vgtm_qp.arm.symbols import Bound, Constants
 from vgtm_qp.arrays import Array
 from vgtm_qp.compiled import Kernel
-from vgtm_qp.qp.graph import StepGraph, station_rows
+from vgtm_qp.qp.graph import Argument, StepGraph, station_rows
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.numbers import ClearanceRows, Legs, StepNumbers
 from vgtm_qp.qp.shape import CurveRows
@@ -59,19 +59,19 @@ class StepInput(NamedTuple):
     def load(self, kernel: Kernel) -> None:
         """Write the arguments of a function of ``StepGraph.inputs``."""
         inputs = kernel.inputs
-        inputs[0][:] = self.q.reshape(-1)
-        inputs[1][:] = self.at.reshape(-1)
-        inputs[2][:] = self.base.reshape(-1)
-        inputs[3][:] = self.vertices.reshape(-1)
-        inputs[4][:] = self.lower
-        inputs[5][:] = self.upper
-        inputs[6][0] = 1.0 if self.motion else 0.0
-        inputs[7][0] = self.progress
-        inputs[8][:] = self.goal.position
-        inputs[9][:] = self.goal.rotation.T.reshape(-1)
-        inputs[10][:] = self.goal.velocity
-        inputs[11][:] = self.goal.spin
-        for k, table in enumerate(self.curve or (), start=12):
+        inputs[Argument.Q][:] = self.q.reshape(-1)
+        inputs[Argument.AT][:] = self.at.reshape(-1)
+        inputs[Argument.BASE][:] = self.base.reshape(-1)
+        inputs[Argument.VERTICES][:] = self.vertices.reshape(-1)
+        inputs[Argument.LOWER][:] = self.lower
+        inputs[Argument.UPPER][:] = self.upper
+        inputs[Argument.MOTION][0] = 1.0 if self.motion else 0.0
+        inputs[Argument.PROGRESS][0] = self.progress
+        inputs[Argument.GOAL][:] = self.goal.position
+        inputs[Argument.TURNED][:] = self.goal.rotation.T.reshape(-1)
+        inputs[Argument.VELOCITY][:] = self.goal.velocity
+        inputs[Argument.SPIN][:] = self.goal.spin
+        for k, table in enumerate(self.curve or (), start=Argument.GIVEN):
             inputs[k][:] = table.reshape(-1)
 
 
