@@ -189,7 +189,7 @@ class JointSpaceArm(Arm):
 
     @cached_property
     def _placing(self) -> tuple[Bound, Compiling]:
-        """The nodes as a function, and what compiles it."""
+        """The function from q to the nodes, and its compilation."""
         constants = Constants()
         symbols = self.symbols(constants)
         q = ca.MX.sym("q", *symbols.shape)
@@ -249,7 +249,7 @@ class JointSpaceArm(Arm):
         return np.where(self.revolute, self.reaches[1:], 1.0)
 
     def deviation(self, start: Array, end: Array) -> float:
-        """See ``arm.Arm``: what no node exceeds, for two of them."""
+        """See ``arm.Arm``: twice the bound for one node, since two may leave their chords towards each other."""
         return 2.0 * self.tip_deviation(start, end, 0.0)
 
     def forces(self, q: Array, load: Array, gravity: Array | None = None) -> Array:

@@ -11,8 +11,8 @@ enum { AXIS = 7 };
 /* Least bound of the distances of pairs that are not listed, over the distance below which pairs are evaluated. */
 static const double AMPLE = 1.3;
 
-/* Motions as the greatest of late for which pairs of bodies are listed, the least share of the slack for which they are,
-   and the share of that greatest motion that counts in the next one. */
+/* How far ahead pairs of bodies are listed: for so many motions like the greatest recent one, but for this share of the
+   slack at least; and the share of the greatest recent motion that still counts after one more. */
 static const double LASTING = 20.0, LEAST_SLACK = 0.1, OF_LATE = 0.9;
 
 /* The lesser of two numbers; NaN if either is NaN. */
@@ -370,7 +370,7 @@ static int list_near(Way *w, double least, double self_least)
         place_parts(w);
         measure_parts(w);
     }
-    /* A list of many pairs that bodies hardly approach costs more in each motion than a new one does once. */
+    /* A list that reaches too far has many pairs, which cost more in each motion than a shorter list costs once. */
     int is_long = w->self_far < INFINITY && w->self_far > horizon + slack;
     if (self_far_of(w) >= self_needed && !is_long) return DONE;
     if (!is_short) place_axes(w);
@@ -474,7 +474,7 @@ static int evaluate(const Way *w, Pairs *p, double floor, double limit, double r
     for (int k = 0; k < p->count; k++) {
         if (p->listed[k].lower >= reach) continue;
         if (contact(w, p, k, before, after, w->since, w->until)) return NO_VALUE;
-        /* The known normal may be of long ago: that at the start of this motion proves more. */
+        /* The known normal may be old; the one at the start of this motion proves more. */
         if (p->found[CONTACTS] < floor && p->listed[k].lower < floor
             && (contact(w, p, k, before, before, w->since, w->since) || contact(w, p, k, before, after, w->since, w->until)))
             return NO_VALUE;

@@ -457,8 +457,8 @@ EXPORT int assemble(Fused *f)
     return DONE;
 }
 
-/* Whether the QP's Hessian and equalities are in the working set's columns; there is room for as many as unknowns then.
-   Without room all others are forgotten. */
+/* Make the Hessian and the equalities the first columns for working sets, unless they are; return whether the Hessian is
+   positive definite. Then there is room for as many columns as unknowns: where there was not, others are forgotten. */
 static int begun(Fused *f)
 {
     Working *w = f->working;
@@ -471,7 +471,7 @@ static int begun(Fused *f)
     return w->is_begun > 0;
 }
 
-/* The column of an unknown, or of n plus the number of a row behind the equalities; -1 if there is no room. */
+/* The column of unknown k, or of row k - n where k is n or more, made if there is none; -1 if there is no room. */
 static int column_of(Fused *f, int k)
 {
     int n = f->unknowns;
@@ -482,8 +482,8 @@ static int column_of(Fused *f, int k)
     return f->column[k] = extend(f->working, k < n ? k : 0);
 }
 
-/* Change the sides of what is in the working set against its will, and of what is beyond its bounds; return whether
-   there are such. */
+/* Take out of the working set what has a multiplier of the wrong sign, and put in what is beyond its bounds; return
+   whether the set changed. */
 static int reconsider(Fused *f, int rows)
 {
     int n = f->unknowns, equal = n + f->tips + f->hard, has_changed = 0;

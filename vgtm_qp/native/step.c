@@ -452,7 +452,7 @@ static int pass(StepData *s, int pieces, double spare)
     w->floor = s->safe + spare;
     w->self_floor = fmax(s->self_safe + spare, 0.0);
     code = prove_path(w);
-    /* The QP is not to be solved once more for want of room: another proof makes some. */
+    /* Where the proof lacks room, the QP need not be solved again: the caller's own proof makes room. */
     return code == FULL ? NOT_PROVEN : code;
 }
 

@@ -110,8 +110,9 @@ static int choose(Working *w, int size)
     return 0;
 }
 
-/* Of the first chosen columns, the shares (size) become the multipliers whose products are the shares. The point becomes
-   that of these multipliers, and of the pull times `pulled`. */
+/* The shares (size) of the first chosen columns are wanted products with these columns. They become the multipliers whose
+   sum of columns has these products; `spread` has them for all columns. The point becomes U^-1 times that sum and
+   `pulled` times the pull. */
 static void combine(Working *w, int size, double pulled)
 {
     solve_lower(w->inner, size, w->most, 0, w->share);

@@ -118,8 +118,8 @@ class Advancer:
     ) -> Iterator[Advance]:
         """Yield attempts with stations on the curve; then others, if these get less than half as far.
 
-        Stations leave the curve only if the arm then gets a quarter further than on it, or hardly moves on
-        it. An arm that cannot stop at once must not be led into a corner like that.
+        Stations leave the curve only if the arm then gets a quarter further than on it, or hardly moves on it. That may
+        lead into a corner, and so is only for arms that can stop at once.
         """
         held: Advance | None = None
         for found in self._pieces(state, target, dt, first, max(smallest, _LEAST_HELD), Tracking.HARD):
@@ -181,7 +181,7 @@ class Advancer:
         *,
         tracking: Tracking = Tracking.EITHER,
     ) -> Advance:
-        """Return a step towards a target; this is a `share` of the target that progress is counted on."""
+        """Return a step and its braking; the target is a `share` of the one on which progress is counted."""
         enough = _LEAST_HELD if self._tip_mode == "scaled" else WHOLE
         step = self._attempt.run(state, target, share, tracking=tracking, enough=enough)
         if not step.moved:

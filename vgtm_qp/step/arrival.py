@@ -1,4 +1,4 @@
-"""What follows where a curve was settled: its end at the tip, and the gaps between stations and curve."""
+"""After a configuration has settled: its curve is ended at the tip, and the gaps of its stations are measured."""
 
 from __future__ import annotations
 

@@ -136,9 +136,9 @@ class ChainEngine(Engine):
     ) -> Settled | None:
         """See ``engine.Engine``: each step corrects the lengths, and the remaining tip error by the actuators.
 
-        The actuated lengths are those of the QP's answer plus a correction that brings the tip to its goal: by what it
-        will miss there once the lengths are corrected.
-        If faces are held on the curve, the lengths follow from the curve as far as bounds allow.
+        The actuated lengths are those of the QP's answer plus corrections, each for what the tip will miss of its goal
+        once the lengths are correct. If faces are held on the curve, the lengths follow from the curve as far as bounds
+        allow.
         """
         closing, solver, bounds = self._closing, self._solver, (target.lower, target.upper)
         enough, enough_tip = enough_length(X, accuracy.member), enough_tip_error(X, accuracy.tip)

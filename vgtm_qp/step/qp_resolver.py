@@ -66,7 +66,7 @@ class QPResolver(Resolver, serves="qp"):
         self._rehearse()
 
     def _rehearse(self) -> None:
-        """Try a step that stays at home: everything that steps make on first use is then there."""
+        """Try a step that stays at home, so that what steps make on first use is made now."""
         if self.setup.elastic is not None:
             self.setup.elastic()
         state, path = self._state, self.setup.task.path_to(self.tip(), None, None, None)

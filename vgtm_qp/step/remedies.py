@@ -185,9 +185,9 @@ def resorts(
 ) -> Iterator[Remedy]:
     """Yield remedies to try where none of those `found` to first order lets the arm go on.
 
-    All that were found at once; then the first one, two and three limits among the rows called `names`, the most
-    decisive first, and these of all actuators; then their obstacles out of the way, alone and with the other limits.
-    `quantities` are the arm's.
+    In this order: all changes that were found, at once; of the rows called `names`, the most decisive first, the limit
+    of the first one, of two and of three; these limits of all actuators; their obstacles out of the way, alone and
+    together with the other limits. `quantities` are the arm's.
     """
     changes = {change.limit: change for remedy in found for change in remedy.changes}
     if 1 < len(changes) <= MOST:

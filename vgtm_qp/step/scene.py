@@ -258,7 +258,7 @@ class ChangingScene(ABC):
         return np.asarray(np.add(table.center, np.multiply(self.state.time, table.velocity)))
 
     def _at_time_0(self, table: Any, changes: dict[str, Any]) -> Any:
-        """Return an obstacle's table with `changes`, its center, given for now, that of time 0."""
+        """Return an obstacle's table with `changes`; its center, which is given for now, becomes that at time 0."""
         try:
             now = type(table)(**{**table.model_dump(), **changes})
             if not any(now.velocity):

@@ -1,4 +1,4 @@
-"""The arrays and numbers by which Python and ``native/step.c`` know of one arm's step."""
+"""The arrays and numbers of one arm's step that Python shares with ``native/step.c``."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _ROOM, _SLOTS = 64, 4
 
 
 class StepData:
-    """The structure of the C's step of one arm with one engine, and its arrays.
+    """The structure of that name in C, for one arm with one engine, and the arrays that it points to.
 
     Attributes
     ----------

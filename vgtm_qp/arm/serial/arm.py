@@ -219,7 +219,7 @@ class SerialArm(JointSpaceArm):
         return np.where(self.chain.revolute, 0.0, np.abs(self.values).max(axis=1, initial=0.0))
 
     def _links(self, radius: float) -> Bodies:
-        """Return links between successive origins; joints in one place count as one where links join."""
+        """Return links between successive origins; joints that are always in one place join links like one joint."""
         place = self._places()
         kept = np.flatnonzero(self._have_length())
         points = np.stack([kept + 1, kept + 2], axis=1)

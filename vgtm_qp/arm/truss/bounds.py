@@ -87,10 +87,10 @@ def frame_deviation(count: int) -> ca.Function:
     """Return a bound of how far a point fixed to a fitted frame leaves its chord where `count` nodes move straight.
 
     Arguments: the nodes (3, K) at both ends of the motion, cosines and sines (K) of their angles, see
-    ``frames.fitted_frame``. The result is over the point's distance from the origin of the frame; inf without a bound.
-    z is the direction of a polynomial A of the share of the motion. The sums c = sum cos s and d = sum sin s of the
-    nodes from their middle are polynomials, too, and x is the direction of v = c + d x z less its part along z, which a
-    triangle has not.
+    ``frames.fitted_frame``. The bound is the result times the point's distance from the origin of the frame; inf
+    without one. z is the direction of A, a polynomial of the share of the motion. With s a node's place from the middle
+    of all, the sums c = sum cos s and d = sum sin s over the nodes are polynomials too. x is the direction of
+    v = c + d x z without its part along z, which is zero for a triangle.
     """
     ends = [ca.SX.sym("start", 3, count), ca.SX.sym("end", 3, count)]
     cosines, sines = ca.SX.sym("cosines", count), ca.SX.sym("sines", count)
@@ -122,7 +122,10 @@ def frame_deviation(count: int) -> ca.Function:
 
 
 def _unit_bounds(before: ca.SX, after: ca.SX, first: ca.SX, second: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Return bounds of the first two derivatives of w/|w| from w (3) at both ends and bounds of its own; or inf."""
+    """Return bounds of the first two derivatives of w/|w|; inf where w may vanish.
+
+    Given are w (3) at both ends of the motion, and bounds of its first two derivatives.
+    """
     least = (ca.norm_2(before) + ca.norm_2(after) - first) / 2.0
     relative = ca.if_else(least > 0.0, first / least, np.inf)
     return relative, ca.if_else(least > 0.0, second / least + 3.0 * relative**2, np.inf)
