@@ -103,8 +103,8 @@ def proof_function(shape: str) -> ca.Function:
     flaw is |d - g| + ||x - y| - d|, and how far the answer's point is from x, and y from the other. The contact has
     the distance g, less the radius; its normal is mostly rounding where g is below `NORMAL_FROM`.
 
-    FCL's iteration beside a cylinder ends where the distance is exact; how far its points then are from the nearest
-    ones turns with rounding. Newton's iteration makes these of them, and their flaw is added.
+    Beside a cylinder FCL's distance is exact, but rounding decides how far its points are from the nearest ones.
+    Newton's iteration leads from them to the nearest ones, whose flaw is added.
     """
     pair, answer = ca.SX.sym("pair", 7 + width(shape)), ca.SX.sym("answer", 7)
     body, other, claimed, y = pair[:6], pair[6:-1], answer[0], answer[4:]

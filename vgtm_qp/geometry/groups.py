@@ -35,7 +35,9 @@ _FIRST = 16
 """Number of pairs, nearest at the reference, that are searched first for the least distance."""
 
 _RELATIVE = 0.5 * np.array([[1.0, 1.0, -1.0, -1.0], [-1.0, 1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 1.0]])
-"""From the shifts of both ends of two bodies to the shift between their middles, and half turns of both."""
+"""Takes displacements of the four ends of two bodies to the relative displacement of their middles, and to half the
+difference of the ends of each body.
+"""
 
 
 class Scene:

@@ -36,7 +36,7 @@ _CONTACTS = 3
 _MOST = 60
 """Greatest number of points of each body in the convex combinations of :func:`_nearest`."""
 _EXACT = 1e-12
-"""Error of these, over the size of what is far from what."""
+"""Gain of a further point, over the unit of length and the distance, below which :func:`_nearest` ends."""
 _OVERLAP = 1e-9
 """Distance, over the unit of length, up to which surfaces count as overlapping."""
 
@@ -97,8 +97,8 @@ class HullGroup(Group):
     def distances(self, X: Array, time: float, rows: Index, enough: float = np.inf) -> Array:
         """Return surface distances (k,) of some pairs, m; below zero where they overlap.
 
-        The least one is exact if it is not `enough`; others may be too small by the error of FCL's answers that are
-        proven.
+        The least one is exact if it is below `enough`. Others are those along FCL's normals, and may be too small by as
+        much as a proven answer may be wrong, see ``PROOF``.
         """
         return self._in_parts(partial(self._distances_of, enough), self.at(X, time, rows))
 

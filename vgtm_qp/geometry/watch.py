@@ -1,8 +1,8 @@
 """The pairs of a scene that may soon be near, evaluated only when they may have come near.
 
-``pairs.c`` lists them, of a small scene all. Each pair keeps a lower bound of its distance: its
+``pairs.c`` lists them, in a small scene all pairs. Each keeps a lower bound of its distance: its
 distance at the last evaluation, less a bound of the approach of its bodies since. A body's distance from an obstacle
-changes by no more than an end of the body moves, and the obstacle. The distance of two bodies changes by no more than
+changes by no more than an end of the body and the obstacle move. The distance of two bodies changes by no more than
 the relative displacement of their middles plus the turns of both about these. If the bound falls below the limit, the
 pair is evaluated, and its distance on the motion from the state before is bounded. The pairs that are not listed have
 bounds as well, and are listed anew before they can be near.
@@ -330,7 +330,7 @@ class Watch:
         return self._way
 
     def _of_pieces(self) -> dict[str, object]:
-        """Return by field what C knows of the pieces, of which no pair is listed."""
+        """Return by field what C knows of the pieces of obstacles; no pair with one is listed yet."""
         pieces, shapes, bodies = self._scene.pieces, self._scene.shapes, len(self._scene.bodies)
         is_small = bodies * (bodies + len(pieces)) <= _FEW_PAIRS
         self._addresses = np.array([pairs.address() for pairs in self._groups], dtype=np.uintp)
