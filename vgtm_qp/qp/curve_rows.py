@@ -112,7 +112,7 @@ class _CurveGraph:
         self._torsion, self._base = ca.MX.sym("torsion", shape.torsion), ca.MX.sym("base", 3, 3)
         self._sound: list[ca.MX] = []
         self._nodes, self._weights = family.gauss
-        # What is said of segments, cells and nodes has a column for each.
+        # Arrays over segments, cells or nodes have one column for each.
         segments = len(family.breaks) - 1
         self._breaks = self._constants.add("breaks", family.breaks).T
         self._extraction = self._constants.add("extraction", family.extraction.reshape(segments, -1))
@@ -177,7 +177,7 @@ class _CurveGraph:
         return speeds
 
     def _check_bends(self) -> None:
-        """Have kappa b, whose integrals the rows of the roll are, smooth in each cell, as its speed is."""
+        """Demand that kappa b, whose integrals are the rows of the roll, is smooth in each cell, like the speed."""
         first, second = self._tables
         bends = _binormal().map(first.shape[1])(self._vertices @ first, self._vertices @ second)
         parts = ca.DM(_finest_parts(self._nodes, self._weights)) @ ca.reshape(bends.T, len(self._nodes), -1)
@@ -339,7 +339,7 @@ class _CurveGraph:
 
 
 def _finest_parts(nodes: Array, weights: Array) -> Array:
-    """Return (2, G) how the last two coefficients in Legendre polynomials follow from values at Gauss points."""
+    """Return the matrix (2, G) from values at Gauss points to the last two coefficients of their Legendre series."""
     degrees = np.arange(len(nodes))
     table = (
         np.polynomial.legendre.legvander(2.0 * nodes - 1.0, degrees[-1])

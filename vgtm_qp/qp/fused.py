@@ -633,7 +633,10 @@ def _elimination(layout: Layout, stages: Sequence[EliminationStage]) -> dict[str
 
 
 def _first_rows(layout: Layout, stages: Sequence[EliminationStage], size: int) -> NDArray[np.int32]:
-    """Return (n,) the first least-squares row that each unknown can change; actuators move what is placed with them."""
+    """Return (n,) the first least-squares row that each unknown can change.
+
+    An actuator moves nodes of its own stage and of later ones.
+    """
     arm, first = layout.arm, np.zeros(size, dtype=np.int32)
     if not stages:
         return first

@@ -99,7 +99,7 @@ class CurveShape(CurvePlacing):
         return curve_function(self).kernel()
 
     def rows_of_any(self, vertices: Array, torsion: Array, base_frame: Array) -> CurveRows:
-        """Return :meth:`rows` by the curve itself, in twenty times the time: also where it has nearly a cusp.
+        """Return :meth:`rows` by the curve itself, in twenty times the time; it may nearly have a cusp.
 
         Nodes by arc length move along the curve when it changes, see ``Curve.arc_node_rates``.
         """
@@ -149,7 +149,7 @@ class CurveShape(CurvePlacing):
 
 
 def _evaluated(kernel: Kernel, vertices: Array, torsion: Array, base_frame: Array) -> list[Array] | None:
-    """Return copies of a kernel's results but the last, which says whether they are right; None where it denies it."""
+    """Return copies of a kernel's results but the last, which says whether they are right; None if they are not."""
     for argument, values in zip(kernel.inputs, (vertices, torsion, base_frame.T), strict=False):
         argument[:] = values.reshape(-1)
     kernel()

@@ -100,7 +100,7 @@ class Workspace(Protocol):
 
 
 class Corrector(Protocol):
-    """Goes on by further QPs in C after an answer that is no step yet."""
+    """Solves further QPs in C where the answer of the one before is no step yet."""
 
     def point(self) -> tuple[Array, Array, Array, float]:
         """Return where the QP solved last was linearised: configuration, control vertices, torsion and progress."""
@@ -120,7 +120,7 @@ class Stepper(Protocol):
 
     @property
     def corrector(self) -> Corrector | None:
-        """What goes on by further QPs, and follows a base that moves; None where C does neither."""
+        """What solves further QPs; None where C can solve none, nor take steps of a moving base."""
 
     def aim(self, accuracy: Accuracy) -> None:
         """Settle to that `accuracy` from now on."""
