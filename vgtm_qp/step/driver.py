@@ -43,13 +43,13 @@ _NOTHING = 1e-9
 """Progress of a QP below which its corrections may go further than the QP."""
 
 _AGAIN = Code.UNSETTLED, Code.TOO_NEAR, Code.OFF_CURVE
-"""How a QP ends that another one may correct."""
+"""Codes of a QP after which another one may correct its answer."""
 
 _SETTLED = Code.NOT_PROVEN, Code.TOO_NEAR, Code.OFF_CURVE
-"""How a call ends whose answer was settled, but is no step yet."""
+"""Codes of a call whose answer may have been settled, and is no step yet."""
 
 _WANTING = Code.ASKS, Code.CROWDED, Code.FULL
-"""How a call ends that is to be answered, and goes on then."""
+"""Codes of a call that goes on once it has what it asks for, contacts or room."""
 
 PHASES = "distance", "qp", "acceptance"
 """Parts of a step whose times are known."""
@@ -163,7 +163,7 @@ class Driver:
         self._started = True
 
     def _called(self, call: Callable[[], int]) -> int:
-        """Return how a QP ended that a `call` solves, where what it asks for is answered, and there is enough room."""
+        """Return the code with which a `call` ends that has got all contacts and room it asked for."""
         code, data = call(), self._arrays.data
         while code and code in _WANTING:
             if code == Code.ASKS:
@@ -204,11 +204,11 @@ class Driver:
     def _left(
         self, corrector: Corrector, state: State, target: Target, begun: Begun, qps: int, code: int
     ) -> Step | Begun:
-        """Return what is left to an attempt after QPs of which the last ended with `code`: a proof, or that QP."""
+        """Return where an attempt goes on after QPs of which the last ended with `code`: at a proof, or at that QP."""
         if code == Code.NOT_PROVEN:
             move = self._solver.led(is_settled=True)
         else:
-            # Where the QP before it led, as far as this one knows.
+            # The QP before it led to where this one was linearised; no more is known of its answer.
             move, qps = Move(begun.first.solution, *corrector.point(), 0.0, None), qps - 1
         begun = begun._replace(move=move, reach=self._arrays.data.reach, qps=qps)
         return self._corrects_nothing(state, target, begun) if code == Code.INFEASIBLE else begun
@@ -230,7 +230,7 @@ class Driver:
         inputs[4][:], inputs[5][:] = target.lower, target.upper
         self._aim_at(target, 0.0)
         if state is not self._held:
-            # What ends the writing half way must not leave a mixture that passes for a state.
+            # An interrupt during the writing must not leave a mixture of two states that passes for one.
             self._held = None
             self._arrays.load(state)
             self._held = state
