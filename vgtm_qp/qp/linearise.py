@@ -13,6 +13,7 @@ from vgtm_qp.qp.graph import Argument, StepGraph, station_rows
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.numbers import ClearanceRows, Legs, StepNumbers
 from vgtm_qp.qp.shape import CurveRows
+from vgtm_qp.qp.stepper import Workspace
 from vgtm_qp.rows.tip import TipGoal, progress_gradient
 
 
@@ -56,7 +57,7 @@ class StepInput(NamedTuple):
     torsion: Array = np.zeros(0)
     base_frame: Array = np.eye(3)
 
-    def load(self, kernel: Kernel) -> None:
+    def load(self, kernel: Kernel | Workspace) -> None:
         """Write the arguments of a function of ``StepGraph.inputs``."""
         inputs = kernel.inputs
         inputs[Argument.Q][:] = self.q.reshape(-1)

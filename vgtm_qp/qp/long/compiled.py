@@ -14,6 +14,7 @@ from vgtm_qp.native import Code, CompiledKernel, Program, building
 from vgtm_qp.qp.answer import Accuracy, Closed, Move, StepSolution
 from vgtm_qp.qp.daqp import Daqp
 from vgtm_qp.qp.fused import daqp_addresses, placement
+from vgtm_qp.qp.graph import Argument
 from vgtm_qp.qp.layout import Layout
 from vgtm_qp.qp.linearise import StepInput
 from vgtm_qp.qp.long.chain_data import ChainData, frame_constants_of, period_values
@@ -171,17 +172,12 @@ class CompiledChain:
 
     def _load(self, asked: StepInput) -> None:
         """Write the state, the goal and the boxes."""
-        layout, inputs = self.layout, self._begin.inputs
-        self._at[:], self._lower[:], self._upper[:] = asked.at, asked.lower, asked.upper
-        if layout.vertices:
-            inputs[2][:] = asked.q[layout.arm.stations.nodes[0]].reshape(-1)
+        asked.load(self)
+        if self.layout.vertices:
+            self._start_nodes[:] = asked.q[self.layout.arm.stations.nodes[0]].reshape(-1)
         self._pull[:] = 0.0
         if asked.motion:
             self.draw(asked.vertices, asked.vertex_goals)
-        goal = asked.goal
-        inputs[4][:], inputs[5][:] = goal.position, goal.rotation.T.reshape(-1)
-        inputs[6][:], inputs[7][:] = goal.velocity, goal.spin
-        inputs[8][0], inputs[9][0] = asked.motion, asked.progress
 
     def draw(self, vertices: Array, goals: Array | None) -> None:
         """See :class:`~vgtm_qp.qp.stepper.Stepper`."""
@@ -205,12 +201,16 @@ class CompiledChain:
         layout, arm = self.layout, self.layout.arm
         self._program = program = Program("Chain")
         self._q, self._at, self._begun = (np.zeros(arm.home.shape) for _ in range(3))
-        self.points, self._pull = self._begin.inputs[3], np.zeros((layout.vertices, 3))
-        self._x, self._y, self._lower, self._upper = (np.zeros(len(arm.actuators)) for _ in range(4))
+        _, _, self._start_nodes, self.points, *given = self._begin.inputs
+        self._pull, base = np.zeros((layout.vertices, 3)), np.zeros(arm.home.size)
+        self._x, self._y, lower, upper = (np.zeros(len(arm.actuators)) for _ in range(4))
         self._quantities = np.zeros(len(arm.quantity_names))
-        for argument in (1, 2, 3, 4):
-            # Goal, its turn, and the rates of both.
-            self.missing.bind_input(argument, self._begin.inputs[argument + 3])
+        state = self._q.reshape(-1), self._at.reshape(-1), base, self.points
+        self._inputs = [*state, lower, upper, *given][: Argument.GIVEN]
+        goal = self._inputs[Argument.GOAL :]
+        for argument, shared in enumerate(goal, start=1):
+            self.missing.bind_input(argument, shared)
+        self._gone = self.missing.inputs[1 + len(goal)]
         program.set(
             begin=self._begin,
             missing=self.missing,
@@ -221,13 +221,13 @@ class CompiledChain:
             pull=self._pull,
             x=self._x,
             y=self._y,
-            lower=self._lower,
-            upper=self._upper,
+            lower=lower,
+            upper=upper,
             quantities=self._quantities,
-            velocity=self._begin.inputs[6],
-            spin=self._begin.inputs[7],
-            motion=self._begin.inputs[8],
-            progress=self._begin.inputs[9],
+            velocity=self._inputs[Argument.VELOCITY],
+            spin=self._inputs[Argument.SPIN],
+            motion=self._inputs[Argument.MOTION],
+            progress=self._inputs[Argument.PROGRESS],
             **self._functions,
             **daqp_addresses(),
         )
@@ -243,12 +243,10 @@ class CompiledChain:
 
     def _begin_steps(self) -> None:
         """Give C the input and the places of the answer in the order of a short arm's QP, see ``step.c``."""
-        layout, base, begin = self.layout, np.zeros(self._q.size), self._begin.inputs
+        layout = self.layout
         if layout.vertices:
             # The base rests at home, wherever this is called.
-            begin[2][:] = layout.arm.home[layout.arm.stations.nodes[0]].reshape(-1)
-        state = self._q.reshape(-1), self._at.reshape(-1), base, self.points
-        self._inputs = [*state, self._lower, self._upper, *begin[8:10], *begin[4:8]]
+            self._start_nodes[:] = layout.arm.home[layout.arm.stations.nodes[0]].reshape(-1)
         self._step, values = Program("Fused"), [self._quantities] * 2
         self._addresses = [
             np.array([array.ctypes.data for array in arrays], dtype=np.uintp)
@@ -263,10 +261,10 @@ class CompiledChain:
             points=self.points,
             started=self._begun,
             started_points=self.points,
-            gone=self.missing.inputs[5],
-            progress=begin[9],
-            velocity=begin[6],
-            spin=begin[7],
+            gone=self._gone,
+            progress=self._inputs[Argument.PROGRESS],
+            velocity=self._inputs[Argument.VELOCITY],
+            spin=self._inputs[Argument.SPIN],
             work=np.zeros(self._q.size),
             **placement(layout),
         )

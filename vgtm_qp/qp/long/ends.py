@@ -70,8 +70,8 @@ def end_function(layout: Layout) -> Bound:
 def begin_function(layout: Layout) -> Bound:
     """Return the rows of both ends as a function for C.
 
-    Arguments: X, Y, base and points of :class:`_Ends`; goal (3), its turn (3, 3), velocity and spin (3) per unit of
-    progress; motion, 1 or 0; progress. Results: error (n_e), rate (n_e) and Jacobian (n_e, 3K) of the tip, row by row;
+    Arguments: X, Y, base and points of :class:`_Ends`; then those of a step from its motion on, see
+    ``graph.Argument``. Results: error (n_e), rate (n_e) and Jacobian (n_e, 3K) of the tip, row by row;
     curvature of the progress; offset and normal of the curve; rows (G, 3V - 5) and bounds (G) of its legs; gradient of
     the progress.
     """
@@ -97,7 +97,7 @@ def begin_function(layout: Layout) -> Bound:
         ends.least,
         tip_rows.progress_gradient(curvature, progress),
     ]
-    inputs = [ends.X, ends.Y, ends.base, ends.points, goal, turned, velocity, spin, motion, progress]
+    inputs = [ends.X, ends.Y, ends.base, ends.points, motion, progress, goal, turned, velocity, spin]
     return ends.bound("begin", inputs, results)
 
 
