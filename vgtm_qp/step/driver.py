@@ -19,6 +19,7 @@ from vgtm_qp.geometry.pairs import Pair
 from vgtm_qp.geometry.watch import Watch
 from vgtm_qp.native import Code
 from vgtm_qp.qp.answer import Move, StepSolution
+from vgtm_qp.qp.graph import Argument
 from vgtm_qp.qp.numbers import ClearanceRows
 from vgtm_qp.qp.residual import CONTRADICTION, InfeasibleStepError
 from vgtm_qp.qp.stepper import Corrector
@@ -216,9 +217,9 @@ class Driver:
     def _aim_at(self, target: Target, progress: float) -> None:
         """Write the goal at a progress along the `target`."""
         inputs, goal = self._work.inputs, target.goal(progress).over(target.end - target.start)
-        inputs[8][:], inputs[10][:] = goal.position, goal.velocity
+        inputs[Argument.GOAL][:], inputs[Argument.VELOCITY][:] = goal.position, goal.velocity
         if self._setup.task.turns is not None:
-            inputs[9].reshape(3, 3)[:], inputs[11][:] = goal.rotation.T, goal.spin
+            inputs[Argument.TURNED].reshape(3, 3)[:], inputs[Argument.SPIN][:] = goal.rotation.T, goal.spin
 
     def _load(self, state: State, target: Target, share: float) -> None:
         """Write the step's state, goal and boxes."""
@@ -227,7 +228,7 @@ class Driver:
         if self._layout.general is not None:
             self._solver.bend(state.torsion, base_frame(self._setup.arm, target.base))
         self._solver.aim(self._acceptance.accuracy)
-        inputs[4][:], inputs[5][:] = target.lower, target.upper
+        inputs[Argument.LOWER][:], inputs[Argument.UPPER][:] = target.lower, target.upper
         self._aim_at(target, 0.0)
         if state is not self._held:
             # An interrupt during the writing must not leave a mixture of two states that passes for one.
