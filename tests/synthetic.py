@@ -196,8 +196,9 @@ def found_clearances(maneuver: Maneuver) -> Maneuver:
     bodies, _, _ = read_obstacles(manifest["problem"], manifest["meshes"], Path(manifest["directory"]))
     states = range(len(maneuver.time))
     bodily = [AgainstBody(motion, body) for body in bodies]
-    clear = [min([pairs.at_state(k).value for pairs in bodily], default=np.inf) for k in states]
-    own = [AgainstMembers(motion).at_state(k).value for k in states]
+    each = [pairs.at_states() for pairs in bodily]
+    clear = [min([found[k].value for found in each], default=np.inf) for k in states]
+    own = [least.value for least in AgainstMembers(motion).at_states()]
     return replace(maneuver, clearance=np.array(clear), self_clearance=np.array(own))
 
 

@@ -56,8 +56,7 @@ def test_both_paths_take_the_same_steps_from_every_state_of_a_maneuver(name, cha
     finish_compiling()
     assert fast.setup.engine.is_ready
     assert isinstance(plain.setup.engine, GeneralEngine)
-    can_be = not monitor.bodies.hulls and (monitor.self_collision or bool(problem.obstacle))
-    assert fast.setup.monitor.is_watched == can_be
+    assert fast.setup.monitor.is_watched == (monitor.self_collision or bool(problem.obstacle))
     assert not plain.setup.monitor.is_watched
     plan = make_plan(problem, *fast.tip())
     value, compared, furthest = plan.path.start, 0, 0.0
@@ -74,5 +73,4 @@ def test_both_paths_take_the_same_steps_from_every_state_of_a_maneuver(name, cha
             furthest = max(furthest, float(apart) if steps[0].progress > 0.05 else 1e-5 * float(apart))
         value += steps[0].progress * (mark - value)
     assert compared >= 20
-    # The last digits of FCL's normals at hulls depend on what it was asked before.
-    assert furthest < (1e-7 if monitor.bodies.hulls else 1e-10)
+    assert furthest < 1e-10

@@ -304,11 +304,12 @@ def test_offset_joints_place_ends_and_bound_their_paths(rng) -> None:
         after = before + 0.1 * rng.normal(size=(5, 3))
         np.testing.assert_allclose(arm.ends(before), truss.member_ends(before), atol=1e-14)
         motion = RecordedMotion(arm, np.array([0.0, 1.0]), np.stack([before, after]))
-        bend = motion.bend(0, member)
+        bend = motion.bend[0]
         h = 1e-3
         for share in np.linspace(h, 1.0 - h, 40):
             low, here, high = (
-                motion.ends_between(0, member, np.full(6, s)) for s in (share - h, share, share + h)
+                motion.ends_between(np.zeros(6, dtype=int), member, np.full(6, s))
+                for s in (share - h, share, share + h)
             )
             second = np.linalg.norm(low - 2 * here + high, axis=2).max(axis=1) / h**2
             assert (second <= bend * (1 + 1e-6) + 1e-6).all()
@@ -340,7 +341,7 @@ def test_bound_between_states_is_below_every_instant_and_close(
     placed = [{**obstacle, "name": obstacle["shape"], "center": center.tolist()} for obstacle in obstacles]
     motion, pairs = encounters(truss, nodes, placed)
     for pair in pairs:
-        limit, bound = pair.between(0, Least(pair.at_state(0).value), Least())
+        limit, bound = pair.between(Least(pair.at_states()[0].value), Least())
         bound_value = min(bound.value, limit.value)
         sampled = []
         for share in np.linspace(0.0, 1.0, 1001):
@@ -349,7 +350,7 @@ def test_bound_between_states_is_below_every_instant_and_close(
         assert bound_value <= min(sampled) + 1e-12
         assert limit.value <= min(sampled) + motion.resolution
         # Where a joint's triangle folds up on the way, its ends have no bound of their bend.
-        if np.isfinite(motion.bend(0, np.arange(6))).all():
+        if np.isfinite(motion.bend).all():
             assert bound_value >= limit.value - motion.resolution - 1e-12
     assert len(motion.ends) == 2
 
@@ -382,7 +383,7 @@ def test_culling_changes_nothing(rng) -> None:
         every = (np.arange(count), np.zeros(count, dtype=int))
         for state in range(3):
             points = pair.motion.ends[state] - pair.body.at(np.array([float(state)]))
-            assert pair.at_state(state).value == pytest.approx(
+            assert pair.at_states()[state].value == pytest.approx(
                 pair.separation(points, every)[0].min(), abs=1e-14
             )
     members = truss.members
@@ -393,7 +394,7 @@ def test_culling_changes_nothing(rng) -> None:
         ends = pairs[-1].motion.ends[state]
         points = np.concatenate([ends[index[0]], ends[index[1]]], axis=1)
         least = pairs[-1].separation(points, index)[0].min()
-        assert pairs[-1].at_state(state).value == pytest.approx(least, abs=1e-14)
+        assert pairs[-1].at_states()[state].value == pytest.approx(least, abs=1e-14)
 
 
 def test_self_collision_and_angles_are_held() -> None:

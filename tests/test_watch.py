@@ -325,6 +325,7 @@ def test_a_pair_without_a_bound_is_never_proven_by_the_pairs_beside_it(broken):
         ends=np.tile(np.array([0, 1], dtype=np.int32), 3), group=np.array([pairs.address], dtype=np.uintp)
     )
     way.set(solid=given, speed=np.zeros(3), allowance=np.zeros(3), radius=np.zeros(3))
+    way.set(span=2, each=2, size=9)
     way.set(wanted=0.1, far=1.0, middle=np.zeros((3, 3)), turned=np.zeros(3), moved=np.zeros(3))
     way.set(place=np.zeros((2, 3)))
     for code in (Code.DONE, Code.NOT_PROVEN):

@@ -152,8 +152,8 @@ class _Simulation:
                 values[k] = states[k, : values.shape[1]] = self._data.qpos
         errors = values - self._wanted
         motion = RecordedMotion(arm, maneuver.time, states)
-        pairs = [AgainstBody(motion, body) for body in self._bodies]
-        least = [min((pair.at_state(k).value for pair in pairs), default=np.inf) for k in range(len(states))]
+        each = [AgainstBody(motion, body).at_states() for body in self._bodies]
+        least = [min((found[k].value for found in each), default=np.inf) for k in range(len(states))]
         return ReplayRun(
             length_error=np.abs(errors).max(axis=1),
             tip_error=np.linalg.norm(tips - maneuver.tip_position, axis=1),

@@ -17,7 +17,7 @@ from vgtm_qp.geometry.pairs import BetweenReport, Contacts, Pair, PairNames, Wan
 from vgtm_qp.geometry.shapes import Obstacle, ObstaclePieces
 from vgtm_qp.geometry.solids import Solids
 from vgtm_qp.geometry.sweep import sweep_group
-from vgtm_qp.geometry.watch import Watch, can_be_watched, is_ready
+from vgtm_qp.geometry.watch import Watch, can_be_watched
 
 __all__ = ["BetweenReport", "Clearance", "Contacts", "Pair"]
 
@@ -28,7 +28,7 @@ class Clearance:
     """Distances of an arm's bodies from obstacles and from each other; one thread at a time.
 
     Positions ``X`` (P, 3), m, are those of the points that ``Bodies.points`` indexes. Lists of pairs that may be near
-    are kept from one call to the next. Scenes without meshes and hulls are also watched, which is faster.
+    are kept from one call to the next. Scenes without meshes are also watched, which is faster.
 
     Parameters
     ----------
@@ -116,7 +116,7 @@ class Clearance:
 
     def watching(self) -> Watch | None:
         """Return what watches the scene, if it can be watched and once that is compiled."""
-        if self._watching is None and self.is_watched and is_ready(self.scene.shapes):
+        if self._watching is None and self.is_watched and self.scene.is_ready():
             self._watching = Watch(self.scene, self.influence, self.self_influence)
         return self._watching if self.is_watched else None
 
@@ -252,10 +252,9 @@ class Clearance:
     ) -> BetweenReport:
         """Prove that no surface distance falls below its floor on straight pieces of equal duration.
 
-        The watch is tried first, then for each piece bounds of the motion, then separating planes, then
-        halves of the time for the remaining pairs. A pair that is not proven after twelve halvings is
-        refused: a false alarm is possible, a false proof is not. Pieces after one that is not proven are not
-        examined.
+        The watch is tried first, then for a piece that it does not prove bounds of the motion, then separating planes,
+        then halves of the time for the remaining pairs. A pair that is not proven after twelve halvings is refused: a
+        false alarm is possible, a false proof is not. Pieces after one that is not proven are not examined.
 
         Parameters
         ----------
@@ -264,8 +263,8 @@ class Clearance:
         start_time, end_time : float
             s; the obstacles move meanwhile.
         floor, self_floor : float
-            For obstacles and, if it differs, between bodies, m. Floors below zero are for surfaces that
-            overlap already. Only the watch can prove them; without it they count as zero.
+            For obstacles and, if it differs, between bodies, m. Floors below zero are for surfaces that overlap
+            already. Only the watch can prove them, of capsules; without it they count as zero.
         thorough : bool
             False if nothing is tried after the watch, where there is one.
         lowered : Lowered or None
@@ -276,21 +275,22 @@ class Clearance:
         GeometryError
             A position is not finite; so do `near` and `least`.
         """
-        self_floor = floor if self_floor is None else self_floor
-        if not lowered and (watch := self.watching()) is not None:
-            proven = watch.follow(places, start_time, end_time, floor, self_floor)
-            if proven or not thorough:
-                return BetweenReport(proven, min(floor, self_floor), np.zeros(0), self.scene.nothing)
-        pieces, lowest = len(places) - 1, np.inf
-        for k in range(pieces):
-            since, until = (start_time + j / pieces * (end_time - start_time) for j in (k, k + 1))
-            report = self._between(
-                places[k], places[k + 1], (since, until), (floor, self_floor), lowered or {}
-            )
-            lowest = min(lowest, report.clearance)
+        floors = floor, floor if self_floor is None else self_floor
+        watch = None if lowered else self.watching()
+        pieces, lowest, k = len(places) - 1, np.inf, 0
+        times = [start_time + j / pieces * (end_time - start_time) for j in range(pieces)] + [end_time]
+        while k < pieces:
+            if watch is not None:
+                proven = watch.follow(places[k:], times[k], end_time, *floors)
+                if proven or not thorough:
+                    return BetweenReport(proven, min(lowest, *floors), np.zeros(0), self.scene.nothing)
+                if watch.followed > 1:
+                    k, lowest = k + watch.followed - 1, min(lowest, *floors)
+            report = self._between(places[k], places[k + 1], (times[k], times[k + 1]), floors, lowered or {})
+            lowest, fraction, k = min(lowest, report.clearance), (k + report.fraction) / pieces, k + 1
             if not report.certified:
                 break
-        return replace(report, clearance=lowest, fraction=(k + report.fraction) / pieces)
+        return replace(report, clearance=lowest, fraction=fraction)
 
     def _between(
         self,

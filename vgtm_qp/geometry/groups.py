@@ -23,6 +23,7 @@ from vgtm_qp.geometry.exact import (
 )
 from vgtm_qp.geometry.fcl_queries import FclQueries
 from vgtm_qp.geometry.pairs import Contacts, PairNames, Wanted
+from vgtm_qp.geometry.searching import Search, is_ready
 from vgtm_qp.geometry.shapes import Obstacle, ObstaclePieces
 
 Found = tuple[Index, Array]
@@ -33,6 +34,9 @@ Lowered = Mapping[tuple[int, int, bool], float]
 
 _FIRST = 16
 """Number of pairs, nearest at the reference, that are searched first for the least distance."""
+
+_CONTACTS = 3
+"""Greatest number of contacts of a pair with a hull, which may lie flat on something."""
 
 _RELATIVE = 0.5 * np.array([[1.0, 1.0, -1.0, -1.0], [-1.0, 1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 1.0]])
 """Takes displacements of the four ends of two bodies to the relative displacement of their middles, and to half the
@@ -55,8 +59,9 @@ class Scene:
         No rows, and no contacts.
     shapes : list of str
         Shapes of the others in the pairs; ``"segment"`` is a body.
-    span : int
-        Number E of points that span a body: contacts have 2 E weights in the place of the four of ``exact``.
+    span, size, each : int
+        Number E of points that span a body; numbers of a contact, which has 2 E weights in the place of the four of
+        ``exact``; greatest number of contacts of a pair.
     """
 
     def __init__(
@@ -65,6 +70,7 @@ class Scene:
         self.bodies, self.has_self, self.unit = bodies, has_self, unit
         self._by_fcl = by_fcl
         self._batches: dict[tuple[Callable[[str], ca.Function], str], Batch] = {}
+        self._searches: dict[str, Search] = {}
         self.put(obstacles)
 
     def put(self, obstacles: Sequence[Obstacle], bodies: Bodies | None = None) -> None:
@@ -73,8 +79,10 @@ class Scene:
         Groups of pairs with obstacles that were made before are of no use afterwards; those of bodies are, unless there
         are other `bodies` now.
         """
-        self.bodies = self.bodies if bodies is None else bodies
+        if bodies is not None:
+            self.bodies, self._searches = bodies, {}
         self.span = self.bodies.points.shape[1]
+        self.size, self.each = 2 * self.span + 5, _CONTACTS if self.bodies.hulls else 2
         self.obstacles = tuple(obstacles)
         self.pieces = ObstaclePieces(self.obstacles)
         names = tuple(obstacle.name for obstacle in self.obstacles)
@@ -83,7 +91,7 @@ class Scene:
             FclQueries(self.pieces, self.bodies, self.unit) if self._by_fcl or self.bodies.hulls else None
         )
         self.fcl, self.of_hulls = queries if self._by_fcl else None, queries
-        self.nothing_found = np.zeros((0, 2 * self.span + 5))
+        self.nothing_found = np.zeros((0, self.size))
         self.nothing = self._contacts(np.zeros((0, 2 * self.span + 4), dtype=np.int64), self.nothing_found)
         self.shapes = [*np.unique(self.pieces.shape).tolist(), *(["segment"] if self.has_self else [])]
         for make in (distance_function, sweep_function, *((proof_function,) if self.fcl else ())):
@@ -125,9 +133,9 @@ class Scene:
 
     def widened(self, found: Array) -> Array:
         """Return contacts (..., ``CONTACT``) of capsules with 2 E weights (..., 2 E + 5)."""
-        if 2 * self.span + 5 == CONTACT:
+        if self.size == CONTACT:
             return found
-        wide = np.zeros((*found.shape[:-1], 2 * self.span + 5))
+        wide = np.zeros((*found.shape[:-1], self.size))
         wide[..., :3], wide[..., NORMAL.start :] = found[..., :3], found[..., NORMAL.start :]
         wide[..., 1 + self.span : 3 + self.span] = found[..., 3:5]
         return wide
@@ -137,6 +145,16 @@ class Scene:
         if (make, shape) not in self._batches:
             self._batches[make, shape] = Batch(make(shape))
         return self._batches[make, shape]
+
+    def is_ready(self) -> bool:
+        """Whether C is there for the pairs of the scene; always false if nothing can be compiled."""
+        return is_ready(self.shapes, has_hulls=bool(self.bodies.hulls))
+
+    def search(self, shape: str) -> Search | None:
+        """Return C's search for the nearest points of pairs of a shape with hulls, once it is there."""
+        if shape not in self._searches and self.is_ready():
+            self._searches[shape] = Search(self.bodies, self.unit, shape)
+        return self._searches.get(shape)
 
 
 class Displacement(NamedTuple):

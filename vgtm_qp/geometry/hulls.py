@@ -7,7 +7,7 @@ disagree, the normal is computed from convex combinations of points of both bodi
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 
 import numpy as np
@@ -31,8 +31,6 @@ _POINTS = 12
 """Numbers of the four points that span a body."""
 _AT_ONCE = 200_000
 """Number of vertices of pairs that are in the memory at a time."""
-_CONTACTS = 3
-"""Greatest number of contacts of a pair: for a hull that lies flat on something."""
 _MOST = 60
 """Greatest number of points of each body in the convex combinations of :func:`_nearest`."""
 _EXACT = 1e-12
@@ -46,11 +44,20 @@ Support = Callable[[Array], Array]
 
 def groups_of(scene: Scene, shape: str, body: Index, other: Index, *, place: int = 0) -> list[Group]:
     """Return the pairs of bodies (C,) and others (C,) of one shape as groups; none is empty."""
+    return [group for group, _ in groups_by_kind(scene, shape, body, other, place=place)]
+
+
+def groups_by_kind(
+    scene: Scene, shape: str, body: Index, other: Index, *, place: int = 0
+) -> Iterator[tuple[Group, Mask]]:
+    """Yield the groups of :func:`groups_of`, and which of the pairs (C,) each has."""
     with_hull = scene.bodies.is_hull[body]
     if shape == "segment":
         with_hull = with_hull | scene.bodies.is_hull[other]
     kinds: list[tuple[type[Group], Mask]] = [(Group, ~with_hull), (HullGroup, with_hull)]
-    return [kind(scene, shape, body[own], other[own], place=place) for kind, own in kinds if own.any()]
+    for kind, own in kinds:
+        if own.any():
+            yield kind(scene, shape, body[own], other[own], place=place), own
 
 
 class HullGroup(Group):
@@ -83,8 +90,7 @@ class HullGroup(Group):
         x, y, normal, proven = self._witnesses(pairs, sides)
         low, high = sides.heights(normal)
         gap = low.min(axis=1) - high
-        found = np.zeros((len(pairs), _CONTACTS, 2 * self.scene.span + 5))
-        span = self.scene.span
+        found, span = np.zeros((len(pairs), self.scene.each, self.scene.size)), self.scene.span
         found[:, 0, 0], found[:, 1:, 0] = gap, FAR
         found[:, :, -4:-1], found[:, :, -1] = normal[:, None], proven[:, None]
         found[:, 0, 1 : 1 + span] = sides.weights_of(x)
@@ -162,11 +168,16 @@ class HullGroup(Group):
         return np.concatenate(found)[np.argsort(order)]
 
     def _witnesses(self, pairs: Array, sides: _Sides) -> tuple[Array, Array, Array, Mask]:
-        """Return nearest points (k, 3) of body and other, m, normals (k, 3), and which of them FCL supplied (k,)."""
+        """Return nearest points (k, 3) of body and other, m, normals (k, 3), and which of them FCL supplied (k,).
+
+        C finds them, or FCL where there is no C.
+        """
         rows, fcl, unit = pairs[:, -1].astype(np.int64), self.scene.of_hulls, self.scene.unit
-        proven = np.zeros(len(pairs), dtype=bool)
+        proven = known = np.zeros(len(pairs), dtype=bool)
         x, y, normal = np.zeros((3, len(pairs), 3))
-        if fcl is not None:
+        if (search := self.scene.search(self.shape)) is not None:
+            x, y, normal, known = search(self.body[rows], self.other[rows], pairs)
+        elif fcl is not None:
             own = pairs[:, :_POINTS].reshape(-1, 4, 3)
             other = pairs[:, _POINTS:-2]
             other = other[:, :_POINTS].reshape(-1, 4, 3) if self.is_self else other
@@ -179,31 +190,18 @@ class HullGroup(Group):
                 normal = (x - y) / apart[:, None]
                 gap = sides.gaps(normal)
                 # NaN fails the comparisons.
-                proven = (np.abs(answers[:, 0] - gap) + np.abs(apart - gap) <= PROOF * unit) & (
+                known = proven = (np.abs(answers[:, 0] - gap) + np.abs(apart - gap) <= PROOF * unit) & (
                     gap > NORMAL_FROM * unit
                 )
             fcl.refused += len(pairs) - int(np.count_nonzero(proven))
-        for k in np.flatnonzero(~proven).tolist():
-            x[k], y[k], normal[k] = self._computed(sides, k)
+        for k in np.flatnonzero(~known).tolist():
+            x[k], y[k], normal[k] = _way_out(sides, k) if search else self._computed(sides, k)
         return x, y, normal, proven
 
     def _computed(self, sides: _Sides, k: int, normal: Array | None = None) -> tuple[Array, Array, Array]:
-        """Return nearest points (3,) and normal (3,) of one pair, without FCL, from a `normal` near it if given.
-
-        Where they overlap, the normal is that of a face, or an axis of the other, along which the way out is shortest.
-        """
-        support = sides.support(k)
-        found = _nearest(sides.vertices[k], support, self.scene.unit, normal)
-        if found is not None:
-            return found
-        best, least = None, -np.inf
-        for way in sides.ways_out(k):
-            below = sides.vertices[k] @ way
-            gap = float(below.min() - support(way) @ way)
-            if gap > least:
-                best, least = (sides.vertices[k][int(below.argmin())], support(way), way), gap
-        assert best is not None
-        return best
+        """Return nearest points (3,) and normal (3,) of one pair, without FCL, from a `normal` near it if given."""
+        found = _nearest(sides.vertices[k], sides.support(k), self.scene.unit, normal)
+        return _way_out(sides, k) if found is None else found
 
     def _further(self, sides: _Sides, heights: Array, x: Array, found: Array) -> None:
         """Add further contacts to `found`: vertices of the hull, far from `x` (k, 3), that are almost as near."""
@@ -211,7 +209,7 @@ class HullGroup(Group):
         near = heights <= (found[:, 0, 0] + PARALLEL * size)[:, None]
         aside, span = sides.vertices - x[:, None], self.scene.span
         away, every = np.linalg.norm(aside, axis=2), np.arange(len(x))
-        for contact in range(1, _CONTACTS):
+        for contact in range(1, self.scene.each):
             distance = np.where(near, away, -1.0)
             k = distance.argmax(axis=1)
             chosen = (distance[every, k] >= SECOND_CONTACT * size).nonzero()[0]
@@ -312,6 +310,22 @@ class _Sides:
         length = np.linalg.norm(normals, axis=1)
         normals = normals[length > 0.0] / length[length > 0.0, None]
         return np.concatenate([normals, -normals])
+
+
+def _way_out(sides: _Sides, k: int) -> tuple[Array, Array, Array]:
+    """Return points (3,) of one pair that overlaps, and the normal (3,) of the shortest way out that is known.
+
+    The normal is that of a face, or an axis of the other.
+    """
+    support = sides.support(k)
+    best, least = None, -np.inf
+    for way in sides.ways_out(k):
+        below = sides.vertices[k] @ way
+        gap = float(below.min() - support(way) @ way)
+        if gap > least:
+            best, least = (sides.vertices[k][int(below.argmin())], support(way), way), gap
+    assert best is not None
+    return best
 
 
 def _weights(points: Array, x: Array, is_hull: Mask) -> Array:

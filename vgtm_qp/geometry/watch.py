@@ -10,22 +10,22 @@ bounds as well, and are listed anew before they can be near.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from functools import cache
+from collections.abc import Iterator
+from itertools import chain
 
-import casadi as ca
 import numpy as np
 
 from vgtm_qp.arrays import Array
-from vgtm_qp.compiled import Compiling, Kernel, compiler
 from vgtm_qp.errors import EvaluationError
-from vgtm_qp.geometry.exact import CONTACT, follow_function, proof_function
+from vgtm_qp.geometry.exact import proof_function
 from vgtm_qp.geometry.formulas import FURTHEST
-from vgtm_qp.geometry.groups import Found, Group, Scene
+from vgtm_qp.geometry.groups import Found, Scene
+from vgtm_qp.geometry.hulls import groups_by_kind
 from vgtm_qp.geometry.pairs import Contacts, Wanted
 from vgtm_qp.geometry.parts import Division
+from vgtm_qp.geometry.searching import hulls_of, kernel, pairs_of
 from vgtm_qp.geometry.shapes import GeometryError
-from vgtm_qp.native import Code, Program, building
+from vgtm_qp.native import Code, Program
 
 AHEAD = 1.2
 """Distance below which pairs are evaluated, over the last limit: the next limit may be larger."""
@@ -33,7 +33,7 @@ AHEAD = 1.2
 _FEW_PAIRS = 4_000
 """Greatest number of bodies, times that of bodies and pieces, of a scene whose pairs are all listed."""
 
-AXIS, _RIGID = 7, 11
+AXIS, _RIGID = 8, 11
 """Numbers in C of the axis of a body, and of the motion of a part of the arm."""
 
 _LISTED = np.dtype([("body", np.int32), ("other", np.int32), ("lower", np.float64)])
@@ -47,33 +47,9 @@ _NEXT = 2.0
 
 
 def can_be_watched(scene: Scene) -> bool:
-    """Return whether there are pairs, no meshes and no hulls."""
+    """Return whether there are pairs, and no meshes."""
     bodies, pieces = len(scene.bodies), scene.pieces
-    simple = not scene.bodies.hulls and "triangle" not in pieces.shape
-    return simple and bodies > 1 and (scene.has_self or len(pieces) > 0)
-
-
-@cache
-def _contact(shape: str, _: str | None) -> tuple[ca.Function, Compiling]:
-    """Return the function that evaluates one pair, and its compilation, once for each compiler."""
-    function = follow_function(shape)
-    return function, Compiling(function)
-
-
-@cache
-def _proof(shape: str, _: str | None) -> tuple[ca.Function, Compiling]:
-    """Return the function that proves an answer of FCL, and its compilation, once for each compiler."""
-    function = proof_function(shape)
-    return function, Compiling(function)
-
-
-def is_ready(shapes: Iterable[str]) -> bool:
-    """Whether scenes of these shapes can be watched; always false if nothing can be compiled."""
-    library = building()
-    if not library.ask():
-        for shape in shapes:
-            _contact(shape, compiler())[1].ask()
-    return library.library is not None
+    return "triangle" not in pieces.shape and bodies > 1 and (scene.has_self or len(pieces) > 0)
 
 
 class ListedPairs:
@@ -81,20 +57,10 @@ class ListedPairs:
 
     def __init__(self, scene: Scene, shape: str) -> None:
         self._scene, self._shape, self.is_self = scene, shape, shape == "segment"
-        function, compiling = _contact(shape, compiler())
-        contact = Kernel(function, compiled=compiling)
-        self._program = Program("Pairs")
-        self._program.set(
-            is_self=int(self.is_self),
-            next=_NEXT,
-            contact=contact,
-            ends=contact.inputs[0],
-            pair=contact.inputs[1],
-            found=contact.outputs[0],
-        )
+        self._program = pairs_of(shape, has_hulls=bool(scene.bodies.hulls))
+        self._program.set(next=_NEXT)
         if scene.fcl is not None:
-            function, compiling = _proof(shape, compiler())
-            proof = Kernel(function, compiled=compiling)
+            proof = kernel(proof_function, shape)
             pair, answer = proof.inputs
             self._program.set(proof=proof, proof_pair=pair, answer=answer, proven=proof.outputs[0])
         self.data = self._program.data
@@ -103,7 +69,8 @@ class ListedPairs:
     def _hold(self, room: int) -> None:
         """Make room for that many pairs; those that were listed are forgotten."""
         self._listed, self._normal = np.zeros(room, dtype=_LISTED), np.zeros((room, 3))
-        self._rows, self._contacts = np.zeros(room, dtype=np.int64), np.zeros((2 * room, CONTACT))
+        self._rows = np.zeros(room, dtype=np.int64)
+        self._contacts = np.zeros((room * self._scene.each, self._scene.size))
         self._program.set(
             count=0,
             near=0,
@@ -135,17 +102,21 @@ class ListedPairs:
         """Return whether no distance in the present state is below `floor`, m."""
         return bool(self._listed["lower"][: self.data.count].min(initial=np.inf) >= floor)
 
-    def near(self, X: Array, time: float, limit: float, by_fcl: bool, wanted: Wanted | None) -> Found:
-        """Return the `wanted` contacts nearer than `limit`, m, in the present state, `X` at a `time`, s."""
-        contacts = self._contacts[: 2 * self.data.near]
+    def near(
+        self, X: Array, time: float, limit: float, by_fcl: bool, wanted: Wanted | None
+    ) -> Iterator[Found]:
+        """Yield the `wanted` contacts nearer than `limit`, m, in the present state, `X` at a `time`, s."""
+        each = self._scene.each
+        contacts = self._contacts[: each * self.data.near]
         near = (contacts[:, 0] < limit).nonzero()[0]
-        rows, contacts = self._rows.take(near >> 1), contacts.take(near, axis=0)
+        rows, contacts = self._rows.take(near // each), contacts.take(near, axis=0)
         body, other = (self._listed[which].take(rows).astype(np.int64) for which in ("body", "other"))
-        group, rows = Group(self._scene, self._shape, body, other), np.arange(len(rows))
-        if wanted is not None:
-            kept = group.chosen(wanted, rows, contacts)
-            rows, contacts = rows[kept], contacts[kept]
-        return group.contacts(X, time, rows, contacts, by_fcl)
+        for group, own in groups_by_kind(self._scene, self._shape, body, other):
+            rows, found = np.arange(len(group)), contacts[own]
+            if wanted is not None:
+                kept = group.chosen(wanted, rows, found)
+                rows, found = rows[kept], found[kept]
+            yield group.contacts(X, time, rows, found, by_fcl)
 
 
 class Watch:
@@ -195,9 +166,8 @@ class Watch:
         limits, near = (limit, self_limit), [pairs for pairs in self._groups if pairs.data.near]
         if any(pairs.data.overlaps for pairs in near):
             return None
-        return self._scene.contacts(
-            [pairs.near(X, time, limits[pairs.is_self], by_fcl, wanted) for pairs in near]
-        )
+        found = [pairs.near(X, time, limits[pairs.is_self], by_fcl, wanted) for pairs in near]
+        return self._scene.contacts(list(chain.from_iterable(found)))
 
     def keeps(self, X: Array, time: float, floor: float, self_floor: float) -> bool:
         """Return whether `X` and `time` are the present state, with no surface distance below its floor, m."""
@@ -235,6 +205,11 @@ class Watch:
             self_floor=self_floor,
         )
         return self._answered("prove_path") is Code.DONE
+
+    @property
+    def followed(self) -> int:
+        """Number of pieces of the last path that were followed: up to the first one that was not proven."""
+        return 0 if self._way is None else int(self._way.data.done)
 
     def _see(self, X: Array, time: float, limit: float, self_limit: float) -> Program:
         """Make `X` and `time` the present state, with all contacts nearer than the limits, m; return C's ``Way``."""
@@ -302,12 +277,18 @@ class Watch:
             "neighbours_at": np.zeros(len(parts) + 1),
         }
         self._way = Program("Way")
+        if bodies.hulls:
+            self._hulls = hulls_of(bodies, self._scene.unit)
+            self._way.set(hulls=self._hulls.address)
         self._way.set(
             points=len(X),
             furthest=FURTHEST,
             place=self._place,
             line=np.zeros((2, *X.shape)),
             bodies=count,
+            span=self._scene.span,
+            each=self._scene.each,
+            size=self._scene.size,
             radius=bodies.radius,
             axis=np.zeros((count, AXIS)),
             middle=np.zeros((count, 3)),

@@ -1,8 +1,9 @@
 """Our own C: one library of all sources in this folder, called with structures of numbers and addresses.
 
 The sources declare the structures that their functions take. :func:`structure` reads the fields from there, their only
-definition. ``pairs.c`` knows which bodies may have come near, ``working.c`` a QP whose working set is known, ``qp.c``
-the QP of a step, ``chain.c`` that of a long arm, ``step.c`` the whole step.
+definition. ``hulls.c`` finds where convex bodies are nearest, ``pairs.c`` knows which bodies may have come near,
+``working.c`` a QP whose working set is known, ``qp.c`` the QP of a step, ``chain.c`` that of a long arm, ``step.c`` the
+whole step.
 """
 
 from __future__ import annotations
@@ -25,9 +26,8 @@ _STRUCT = re.compile(r"typedef struct \{((?:(?!typedef).)*?)\} (\w+);", re.DOTAL
 _COMMENT = re.compile(r"/\*.*?\*/", re.DOTALL)
 _FUNCTION_POINTER = re.compile(r"\(\*(\w+)\)")
 
-_SOURCES = tuple(
-    Path(__file__).with_name(name) for name in ("base.h", "pairs.c", "working.c", "qp.c", "chain.c", "step.c")
-)
+_NAMES = "base.h", "hulls.c", "pairs.c", "working.c", "qp.c", "chain.c", "step.c"
+_SOURCES = tuple(map(Path(__file__).with_name, _NAMES))
 
 INCLUDES = Path(ca.__file__).parent / "include"
 """Headers of the libraries in CasADi's wheel, DAQP's among them."""

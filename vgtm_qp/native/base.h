@@ -1,4 +1,5 @@
-/* The beginning of our C: what follows it in one text are pairs.c, qp.c, chain.c and step.c. */
+/* The beginning of our C: what follows it in one text are hulls.c, pairs.c, working.c, qp.c, chain.c and
+   step.c. */
 
 #include <math.h>
 #include <stdlib.h>
@@ -45,6 +46,28 @@ static void cross(const double *a, const double *b, double *c)
     c[0] = a[1] * b[2] - a[2] * b[1];
     c[1] = a[2] * b[0] - a[0] * b[2];
     c[2] = a[0] * b[1] - a[1] * b[0];
+}
+
+/* The lesser of two numbers; NaN if either is NaN. */
+static double least_of(double a, double b)
+{
+    return b >= a || a != a ? a : b;
+}
+
+static double square_of(const double *before, const double *after)
+{
+    double square = 0.0;
+    for (int a = 0; a < 3; a++) square += (after[a] - before[a]) * (after[a] - before[a]);
+    return square;
+}
+
+/* The mean (3) of points (count, 3) by weights of sum 1. */
+static void mean_of(const double *points, const double *weights, int count, double *mean)
+{
+    for (int a = 0; a < 3; a++) {
+        mean[a] = 0.0;
+        for (int k = 0; k < count; k++) mean[a] += weights[k] * points[3 * k + a];
+    }
 }
 
 /* The greatest magnitude of numbers; NaN if one is. */

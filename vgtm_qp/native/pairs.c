@@ -2,11 +2,15 @@
    these. */
 
 /* Lengths of the arrays of follow_function: ends of a pair before and after a motion; known, which are a piece, a radius
-   and a normal; the two contacts, whose normals are numbers 5 to 7 of each, from 0. */
-enum { ENDS = 24, KNOWN = 19, SOLID = 15, KNOWN_NORMAL = 16, CONTACTS = 18, CONTACT = 9, NORMAL = 5 };
+   and a normal; the two contacts and a bound. */
+enum { ENDS = 24, KNOWN = 19, SOLID = 15, KNOWN_NORMAL = 16, CONTACTS = 18, CONTACT = 9 };
 
-/* Numbers of the axis of a body at a place: its middle, half of it, and the radius of a ball round the body. */
-enum { AXIS = 7 };
+/* Contacts of a pair at most, and their numbers, where bodies are hulls; where they are capsules, CONTACTS and CONTACT. */
+enum { MOST_CONTACTS = 3, WIDE = 13 };
+
+/* Numbers of the axis of a body at a place: its middle, half of it, the radius of a ball round the body, and how far the
+   body reaches from the axis. */
+enum { AXIS = 8 };
 
 /* Least bound of the distances of pairs that are not listed, over the distance below which pairs are evaluated. */
 static const double AMPLE = 1.3;
@@ -15,19 +19,6 @@ static const double AMPLE = 1.3;
    slack at least; and the share of the greatest recent motion that still counts after one more. */
 static const double LASTING = 20.0, LEAST_SLACK = 0.1, OF_LATE = 0.9;
 
-/* The lesser of two numbers; NaN if either is NaN. */
-static double least_of(double a, double b)
-{
-    return b >= a || a != a ? a : b;
-}
-
-static double square_of(const double *before, const double *after)
-{
-    double square = 0.0;
-    for (int a = 0; a < 3; a++) square += (after[a] - before[a]) * (after[a] - before[a]);
-    return square;
-}
-
 /* A body, and a piece or another body, with a lower bound of their distance. */
 typedef struct { int body, other; double lower; } Listed;
 
@@ -35,12 +26,15 @@ typedef struct { int body, other; double lower; } Listed;
 typedef struct {
     int count, room, is_self;
     Listed *listed;                      /* (room) */
-    double *normal;                      /* (room, 3): unit, of the last evaluation */
+    double *normal;                      /* (room, 3): unit, of the last evaluation in which the bodies were apart */
     double next;                         /* if no pair is near, pairs below next * limit are evaluated too */
 
     Kernel contact;                      /* (ends 24, known 19) -> 18 numbers of contacts, and a bound */
     double *ends, *pair;
     const double *found;
+
+    /* Where bodies are hulls: see Convex, of pieces alone; and turning_gap. */
+    Kernel furthest, turning;
 
     Kernel proof;                        /* (pair, answer 7) -> contact 9, its last number the flaw; or no eval */
     double *proof_pair, *answer;
@@ -49,7 +43,7 @@ typedef struct {
     int near, is_close, overlaps;
     double lowest;                       /* least lower bound over the motion of the evaluated pairs */
     Index *rows;                         /* (room): the evaluated pairs */
-    double *contacts;                    /* (2 room, 9): two for each */
+    double *contacts;                    /* (room, each, size) */
 } Pairs;
 
 /* The motion of a part of an arm: displacement of its centre, turn, and how far points leave that motion; the centre, and
@@ -70,10 +64,14 @@ typedef struct {
     double *line;                    /* (2, P, 3) */
     int lost;                        /* whether a pair had no value, so that nothing is known of any */
 
-    int bodies;
-    const int *ends, *touching, *touching_at;    /* (B, 2) points; the bodies that each may touch, and where they begin */
+    /* Points that span a body: two, or four where some are hulls, of which capsules have theirs twice. Contacts of a pair,
+       and numbers of a contact: a distance, weights of all points of both, the normal, whether it is the only one of its
+       pair. */
+    int bodies, span, each, size;
+    const int *ends, *touching, *touching_at;    /* (B, span); the bodies that each may touch, and where they begin */
     const double *radius;            /* (B) */
-    double *axis;                    /* (B, 7) */
+    const Hulls *hulls;              /* null if all bodies are capsules */
+    double *axis;                    /* (B, 8) */
     /* Convex pieces of obstacles: parameters at time 0 (15), centre then and radius of the ball round it, allowance,
        velocity and speed, m/s, the greatest of these, and the number of its group. */
     int solids;
@@ -103,10 +101,29 @@ typedef struct {
     int done;                        /* number of pieces that were followed */
 } Way;
 
-/* Which points are the ends of pair k: two of the body, then two of the other body, or the same again for a piece. */
+/* Which points span pair k: those of the body, then those of the other body, or the same again for a piece. */
 static int point_of(const Way *w, const Pairs *p, int k, int end)
 {
-    return w->ends[2 * (end < 2 || !p->is_self ? p->listed[k].body : p->listed[k].other) + end % 2];
+    int body = end < w->span || !p->is_self ? p->listed[k].body : p->listed[k].other;
+    return w->ends[w->span * body + end % w->span];
+}
+
+/* Whether a body is a hull. */
+static int is_hull(const Way *w, int body)
+{
+    return w->hulls && w->hulls->sizes[body] > 0.0;
+}
+
+/* Whether a body of pair k is a hull. */
+static int has_hull(const Way *w, const Pairs *p, int k)
+{
+    return is_hull(w, p->listed[k].body) || (p->is_self && is_hull(w, p->listed[k].other));
+}
+
+/* Where the normal (3) of a contact begins. */
+static int normal_at(const Way *w)
+{
+    return w->size - 4;
 }
 
 /* The radius of the body of pair k less the allowance of the piece, or the sum of both radii. */
@@ -115,22 +132,31 @@ static double thickness_of(const Way *w, const Pairs *p, int k)
     return w->radius[p->listed[k].body] + (p->is_self ? w->radius[p->listed[k].other] : -w->allowance[p->listed[k].other]);
 }
 
-static void displace(Way *w, const double *before, const double *after)
+/* Write the motion of all bodies, which `span` points span each. */
+static inline void displace_by(Way *w, const double *before, const double *after, int span)
 {
     for (int b = 0; b < w->bodies; b++) {
-        double square[3] = {0.0, 0.0, 0.0};
-        const int *ends = w->ends + 2 * b;
-        for (int a = 0; a < 3; a++) {
-            double first = after[3 * ends[0] + a] - before[3 * ends[0] + a];
-            double second = after[3 * ends[1] + a] - before[3 * ends[1] + a];
-            w->middle[3 * b + a] = 0.5 * (first + second);
-            square[0] += first * first;
-            square[1] += second * second;
-            square[2] += 0.25 * (second - first) * (second - first);
+        double moved[SPAN][3], *middle = w->middle + 3 * b, furthest = 0.0, turned = 0.0;
+        middle[0] = middle[1] = middle[2] = 0.0;
+        for (int k = 0; k < span; k++)
+            for (int a = 0; a < 3; a++) {
+                int point = 3 * w->ends[span * b + k] + a;
+                moved[k][a] = after[point] - before[point];
+                middle[a] += moved[k][a] / span;
+            }
+        for (int k = 0; k < span; k++) {
+            furthest = fmax(furthest, dot(moved[k], moved[k], 3));
+            turned = fmax(turned, square_of(middle, moved[k]));
         }
-        w->turned[b] = sqrt(square[2]);
-        w->moved[b] = sqrt(square[0] > square[1] ? square[0] : square[1]);
+        w->turned[b] = sqrt(turned);
+        w->moved[b] = sqrt(furthest);
     }
+}
+
+static void displace(Way *w, const double *before, const double *after)
+{
+    if (w->span == 2) displace_by(w, before, after, 2);
+    else displace_by(w, before, after, SPAN);
 }
 
 /* Write the centre of part k at a place, and how far its points are from it. */
@@ -240,16 +266,17 @@ static void measure_parts(Way *w)
     w->parted = least;
 }
 
-/* List the pair of a body and another one, or a piece, whose axis (7) is `second`, if the plane across the line between
-   their middles does not hold them apart by the horizon; `thick` is the sum of their radii. */
-static int list_if_near(const Way *w, Pairs *p, int body, int other, const double *second, double thick, double horizon)
+/* List the pair of a body and another one, or a piece, whose axis (8) is `second`, if the plane across the line between
+   their middles does not hold them apart by the horizon. */
+static int list_if_near(const Way *w, Pairs *p, int body, int other, const double *second, double horizon)
 {
     const double *first = w->axis + AXIS * body;
     double between[3], room = horizon + first[6] + second[6], square = square_of(first, second), lower = -INFINITY;
     if (square >= room * room) return DONE;
     for (int a = 0; a < 3; a++) between[a] = second[a] - first[a];
     double apart = sqrt(square);
-    if (apart > 0.0) lower = apart - (fabs(dot(between, first + 3, 3)) + fabs(dot(between, second + 3, 3))) / apart - thick;
+    double along = fabs(dot(between, first + 3, 3)) + fabs(dot(between, second + 3, 3));
+    if (apart > 0.0) lower = apart - along / apart - first[7] - second[7];
     if (lower >= horizon) return DONE;
     if (p->is_self)
         for (int i = w->touching_at[body]; i < w->touching_at[body + 1]; i++)
@@ -291,9 +318,9 @@ static int list_solids(Way *w, double horizon)
     for (int o = 0; o < w->solids; o++) {
         double ball[AXIS] = {0.0};
         for (int a = 0; a < 3; a++) ball[a] = w->centre[3 * o + a] + w->time * w->velocity[3 * o + a];
-        ball[6] = w->extent[o];
+        ball[6] = ball[7] = w->extent[o];
         for (int b = 0; b < w->bodies; b++)
-            if (list_if_near(w, w->group[w->kind[o]], b, o, ball, w->radius[b] + w->extent[o], horizon)) return FULL;
+            if (list_if_near(w, w->group[w->kind[o]], b, o, ball, horizon)) return FULL;
     }
     sort_pairs(w, 0);
     w->far = w->solids ? horizon : INFINITY;
@@ -322,7 +349,7 @@ static int list_bodies(Way *w, double horizon)
                 for (int j = q > k ? w->bodies_at[q] : i + 1; j < w->bodies_at[q + 1]; j++) {
                     int first = w->part_bodies[i], second = w->part_bodies[j];
                     int a = first < second ? first : second, b = first + second - a;
-                    if (list_if_near(w, p, a, b, w->axis + AXIS * b, w->radius[a] + w->radius[b], horizon)) return FULL;
+                    if (list_if_near(w, p, a, b, w->axis + AXIS * b, horizon)) return FULL;
                 }
         }
     }
@@ -333,17 +360,27 @@ static int list_bodies(Way *w, double horizon)
     return DONE;
 }
 
-/* Write the axes of all bodies at the present place. */
+/* Write the axes of all bodies at the present place; those of hulls are points, the middles of balls round them. */
 static void place_axes(Way *w)
 {
     for (int b = 0; b < w->bodies; b++) {
-        const double *p = w->place + 3 * w->ends[2 * b], *q = w->place + 3 * w->ends[2 * b + 1];
+        const int *ends = w->ends + w->span * b;
+        const double *p = w->place + 3 * ends[0], *q = w->place + 3 * ends[1];
         double *axis = w->axis + AXIS * b;
         for (int a = 0; a < 3; a++) {
             axis[a] = 0.5 * (p[a] + q[a]);
             axis[3 + a] = 0.5 * (q[a] - p[a]);
         }
         axis[6] = norm(axis + 3, 3) + w->radius[b];
+        axis[7] = w->radius[b];
+        if (!is_hull(w, b)) continue;
+        double square = 0.0;
+        for (int a = 0; a < 3; a++) {
+            axis[a] = 0.5 * (axis[a] + 0.5 * (w->place[3 * ends[2] + a] + w->place[3 * ends[3] + a]));
+            axis[3 + a] = 0.0;
+        }
+        for (int k = 0; k < SPAN; k++) square = fmax(square, square_of(axis, w->place + 3 * ends[k]));
+        axis[6] = axis[7] = sqrt(square) + w->radius[b];
     }
 }
 
@@ -386,22 +423,213 @@ static void from_piece(const Way *w, const Pairs *p, int k, double time, int poi
     for (int i = 0; i < 3 * points; i++) x[i] -= time * w->velocity[3 * p->listed[k].other + i % 3];
 }
 
-/* Evaluate pair k over a straight motion between two times, from the known normal at its start. */
-static int contact(const Way *w, Pairs *p, int k, const double *before, const double *after, double since, double until)
+/* Write a contact of capsules, its weights those of the first two points of both bodies. */
+static void widen(const Way *w, const double *narrow, double *wide)
 {
-    for (int i = 0; i < 4; i++) {
-        int point = 3 * point_of(w, p, k, i);
-        memcpy(p->ends + 3 * i, before + point, 3 * sizeof(double));
-        memcpy(p->ends + ENDS / 2 + 3 * i, after + point, 3 * sizeof(double));
-    }
-    from_piece(w, p, k, since, 4, p->ends);
-    from_piece(w, p, k, until, 4, p->ends + ENDS / 2);
+    memset(wide, 0, w->size * sizeof(double));
+    memcpy(wide, narrow, 3 * sizeof(double));
+    memcpy(wide + 1 + w->span, narrow + 3, 2 * sizeof(double));
+    memcpy(wide + normal_at(w), narrow + CONTACT - 4, 4 * sizeof(double));
+}
+
+/* Write where the points of pair k are that span it (2 span, 3). */
+static void points_of(const Way *w, const Pairs *p, int k, const double *place, double time, double *points)
+{
+    for (int i = 0; i < 2 * w->span; i++) memcpy(points + 3 * i, place + 3 * point_of(w, p, k, i), 3 * sizeof(double));
+    from_piece(w, p, k, time, 2 * w->span, points);
+}
+
+/* Evaluate capsules between places of the points that span pair k: write its contacts, and a bound of its distance on the
+   way. */
+static int capsule_contacts(const Way *w, Pairs *p, int k, const double *before, const double *after, double *contacts,
+                            double *bound)
+{
+    const double *places[2] = {before, after};
+    for (int i = 0; i < 4; i++)
+        memcpy(p->ends + 6 * i, places[i / 2] + 3 * w->span * (i % 2), 6 * sizeof(double));
     if (!p->is_self) memcpy(p->pair, w->solid + SOLID * p->listed[k].other, SOLID * sizeof(double));
     p->pair[SOLID] = thickness_of(w, p, k);
     memcpy(p->pair + KNOWN_NORMAL, p->normal + 3 * k, 3 * sizeof(double));
     if (call(&p->contact)) return NO_VALUE;
-    memcpy(p->normal + 3 * k, p->found + NORMAL, 3 * sizeof(double));
+    for (int i = 0; i < w->each; i++) {
+        if (i < 2) widen(w, p->found + CONTACT * i, contacts + w->size * i);
+        else contacts[w->size * i] = INFINITY;
+    }
+    *bound = p->found[CONTACTS];
     return DONE;
+}
+
+/* The two sets of a pair, their numbers (2), where the points that span it are at `points` (8, 3): two bodies, or a body
+   and a piece. */
+static void sets_of(const Hulls *h, const Pairs *p, const int *numbers, const double *points, const double *piece,
+                    Convex *body, Convex *other)
+{
+    Convex *sets[2] = {body, other};
+    for (int i = 0; i < (p->is_self ? 2 : 1); i++) {
+        int first = h->vertices_at[numbers[i]];
+        int count = h->vertices_at[numbers[i] + 1] - first;
+        *sets[i] = (Convex){count, points + 3 * SPAN * i, h->vertices + SPAN * first, 0};
+    }
+    if (p->is_self) return;
+    *other = (Convex){0, 0, 0, &p->furthest};
+    memcpy((double *)p->furthest.arg[0], piece, SOLID * sizeof(double));
+}
+
+/* Find the contact of an axis at rest, from end to end (6), with a piece; it is among what was found. */
+static int touch(Pairs *p, const double *ends, const double *piece)
+{
+    for (int i = 0; i < 2; i++) memcpy(p->ends + ENDS / 2 * i, ends, 6 * sizeof(double));
+    memcpy(p->pair, piece, SOLID * sizeof(double));
+    p->pair[SOLID] = 0.0;
+    return call(&p->contact);
+}
+
+/* Take what is known of a hull's vertex or edge beside a piece from the function of axes: at a rim, a search finds no more
+   than half of the digits of a normal, whose square is the error of a distance. */
+static int sharpen(const Hulls *h, Pairs *p, const double *piece, const Convex *body, const Convex *other, double *normal,
+                   double *gap, Mean *m)
+{
+    int first = m->vertex[0][0], last = first, vertex[2];
+    double ends[6], own[3], others[3];
+    for (int i = 1; i < m->count; i++) {
+        if (m->vertex[i][0] == first || m->vertex[i][0] == last) continue;
+        if (last != first) return DONE;
+        last = m->vertex[i][0];
+    }
+    mean_of(body->points, body->weights + SPAN * first, SPAN, ends);
+    mean_of(body->points, body->weights + SPAN * last, SPAN, ends + 3);
+    if (touch(p, ends, piece)) return NO_VALUE;
+    double found = gap_along(body, other, p->found + CONTACT - 4, own, others, vertex);
+    /* Another edge may be nearer, or the axis cut the piece. */
+    if (!(found >= *p->found - EXACT * (h->unit + *p->found))) return DONE;
+    *gap = found;
+    memcpy(normal, p->found + CONTACT - 4, 3 * sizeof(double));
+    m->count = 2;
+    for (int i = 0; i < 2; i++) {
+        m->vertex[i][0] = i ? last : first;
+        memcpy(m->own[i], ends + 3 * i, 3 * sizeof(double));
+        memcpy(m->others[i], others, 3 * sizeof(double));
+        m->weight[i] = p->found[1 + i];
+    }
+    return DONE;
+}
+
+/* Find the nearest points of a pair with a hull, as approach does. */
+static int find_nearest(const Hulls *h, Pairs *p, const double *piece, const Convex *body, const Convex *other,
+                        double *normal, double *gap, Mean *m)
+{
+    int code = approach(body, other, h->unit, normal, gap, m);
+    return code || p->is_self ? code : sharpen(h, p, piece, body, other, normal, gap, m);
+}
+
+/* Add contacts of a hull, of that size, at vertices far from its nearest point x that are almost as near, see _further in
+   geometry/hulls.py; the first contact is there. The other set reaches up to `high` along its normal. */
+static int add_further(const Way *w, Pairs *p, const double *piece, const Convex *body, double size, const double *x,
+                       double high, double *contacts)
+{
+    const double *normal = contacts + normal_at(w);
+    double reach = contacts[0] + w->hulls->parallel * size, axis[3] = {0.0};
+    for (int c = 1; c < w->each; c++) contacts[w->size * c] = INFINITY;
+    for (int c = 1; c < w->each; c++) {
+        double most = w->hulls->aside * size, distance = 0.0, place[6], way[3];
+        int best = -1;
+        for (int v = 0; v < body->count; v++) {
+            double point[3], beside[3];
+            mean_of(body->points, body->weights + SPAN * v, SPAN, point);
+            double height = dot(point, normal, 3) - high;
+            if (height > reach) continue;
+            for (int a = 0; a < 3; a++) beside[a] = point[a] - x[a];
+            double along = dot(beside, axis, 3);
+            for (int a = 0; a < 3; a++) beside[a] -= along * axis[a];
+            double far = norm(beside, 3);
+            if (far <= most) continue;
+            most = far;
+            best = v;
+            distance = height;
+            for (int i = 0; i < 2; i++) memcpy(place + 3 * i, point, sizeof(point));
+            memcpy(way, beside, sizeof(way));
+        }
+        if (best < 0) return DONE;
+        /* The next one is far from the line through both. */
+        for (int a = 0; a < 3; a++) axis[a] = way[a] / most;
+        if (!p->is_self) {
+            if (touch(p, place, piece)) return NO_VALUE;
+            distance = *p->found;
+        }
+        if (!(distance <= reach)) continue;
+        double *contact = contacts + w->size * c;
+        memcpy(contact, contacts, w->size * sizeof(double));
+        memcpy(contact + 1, body->weights + SPAN * best, SPAN * sizeof(double));
+        *contact = distance;
+    }
+    return DONE;
+}
+
+/* Evaluate pair k, which has a hull, as capsule_contacts does. Bodies that overlap have no distance: minus infinity. */
+static int hull_contacts(const Way *w, Pairs *p, int k, const double *before, const double *after, double *contacts,
+                         double *bound)
+{
+    const Hulls *h = w->hulls;
+    Convex bodies[2], others[2];
+    Mean mean;
+    int numbers[2] = {p->listed[k].body, p->listed[k].other};
+    const double *piece = w->solid + SOLID * (p->is_self ? 0 : numbers[1]);
+    double *known = p->normal + 3 * k, first[3], gap, thick = thickness_of(w, p, k), x[3], point[3];
+    memset(contacts, 0, w->each * w->size * sizeof(double));
+    sets_of(h, p, numbers, before, piece, bodies, others);
+    sets_of(h, p, numbers, after, piece, bodies + 1, others + 1);
+    memcpy(first, known, sizeof(first));
+    int code = find_nearest(h, p, piece, bodies + 1, others + 1, known, &gap, &mean);
+    if (code == OVERLAPPING) {
+        for (int c = 0; c < w->each; c++) contacts[w->size * c] = -INFINITY;
+        *bound = -INFINITY;
+        return DONE;
+    }
+    if (code || turning_gap(&p->turning, bodies, others, first, known, bound)) return NO_VALUE;
+    *contacts = gap;
+    for (int i = 0; i < mean.count; i++)
+        for (int j = 0; j < SPAN; j++) {
+            contacts[1 + j] += mean.weight[i] * bodies[1].weights[SPAN * mean.vertex[i][0] + j];
+            if (p->is_self) contacts[1 + SPAN + j] -= mean.weight[i] * others[1].weights[SPAN * mean.vertex[i][1] + j];
+        }
+    memcpy(contacts + normal_at(w), known, sizeof(first));
+    mean_of(mean.own[0], mean.weight, mean.count, x);
+    furthest(others + 1, known, point);
+    code = add_further(w, p, piece, bodies + 1, h->sizes[numbers[0]], x, dot(known, point, 3), contacts);
+    for (int c = 0; c < w->each; c++) contacts[w->size * c] -= thick;
+    *bound -= thick;
+    return code;
+}
+
+/* Lower bounds (2) of the distance of pair k, which has a hull, over a straight motion between two times and at its end:
+   the gaps of the plane across the known normal. */
+static void known_gaps(const Way *w, Pairs *p, int k, const double *before, const double *after, double since, double until,
+                       double *gaps)
+{
+    const double *places[2] = {before, after}, *piece = w->solid + SOLID * (p->is_self ? 0 : p->listed[k].other);
+    double times[2] = {since, until}, points[3 * 2 * SPAN], own[3], others[3];
+    int numbers[2] = {p->listed[k].body, p->listed[k].other}, vertex[2];
+    for (int i = 0; i < 2; i++) {
+        Convex body, other;
+        points_of(w, p, k, places[i], times[i], points);
+        sets_of(w->hulls, p, numbers, points, piece, &body, &other);
+        gaps[i] = gap_along(&body, &other, p->normal + 3 * k, own, others, vertex) - thickness_of(w, p, k);
+    }
+    gaps[0] = least_of(gaps[0], gaps[1]);
+}
+
+/* Evaluate pair k over a straight motion between two times, from the known normal at its start: write its contacts
+   (each, size), and a bound of its distance meanwhile. */
+static int contact(const Way *w, Pairs *p, int k, const double *before, const double *after, double since, double until,
+                   double *contacts, double *bound)
+{
+    double start[3 * 2 * SPAN], end[3 * 2 * SPAN];
+    points_of(w, p, k, before, since, start);
+    points_of(w, p, k, after, until, end);
+    if (has_hull(w, p, k)) return hull_contacts(w, p, k, start, end, contacts, bound);
+    int code = capsule_contacts(w, p, k, start, end, contacts, bound);
+    memcpy(p->normal + 3 * k, contacts + normal_at(w), 3 * sizeof(double));
+    return code;
 }
 
 /* The two ends of the body's axis (6) of pair k at `place`, for its `contact`: the nearest point twice where another
@@ -410,7 +638,7 @@ static void ends_for(const Way *w, const Pairs *p, int k, const double *place, c
 {
     const double *a = place + 3 * point_of(w, p, k, 0), *b = place + 3 * point_of(w, p, k, 1);
     double t = contact[2];
-    int is_only = contact[CONTACT - 1] != 0.0;
+    int is_only = contact[w->size - 1] != 0.0;
     for (int i = 0; i < 3; i++) {
         double point = (1.0 - t) * a[i] + t * b[i];
         ends[i] = is_only ? a[i] : point;
@@ -435,7 +663,8 @@ static int prove(const Way *w, Pairs *p, int k, const double *answer, double fla
     double *pair = p->proof_pair, *radius = pair + (p->is_self ? 12 : SOLID + 6);
     ends_for(w, p, k, place, contact, pair);
     if (p->is_self)
-        for (int i = 0; i < 2; i++) memcpy(pair + 6 + 3 * i, place + 3 * point_of(w, p, k, 2 + i), 3 * sizeof(double));
+        for (int i = 0; i < 2; i++)
+            memcpy(pair + 6 + 3 * i, place + 3 * point_of(w, p, k, w->span + i), 3 * sizeof(double));
     else memcpy(pair + 6, w->solid + SOLID * p->listed[k].other, SOLID * sizeof(double));
     *radius = thickness_of(w, p, k);
     memcpy(p->answer, answer, 7 * sizeof(double));
@@ -444,9 +673,10 @@ static int prove(const Way *w, Pairs *p, int k, const double *answer, double fla
     if (call(&p->proof)) return 0;
     /* NaN fails the comparisons. */
     if (!(p->proven[CONTACT - 1] <= flaw && p->proven[0] + *radius > apart)) return 0;
-    double weights[2] = {contact[1], contact[2]};
-    memcpy(contact, p->proven, (CONTACT - 1) * sizeof(double));
-    if (contact[CONTACT - 1] == 0.0) memcpy(contact + 1, weights, sizeof(weights));
+    double weights[2] = {contact[1], contact[2]}, is_only = contact[w->size - 1];
+    widen(w, p->proven, contact);
+    contact[w->size - 1] = is_only;
+    if (is_only == 0.0) memcpy(contact + 1, weights, sizeof(weights));
     return 1;
 }
 
@@ -472,19 +702,28 @@ static int evaluate(const Way *w, Pairs *p, double floor, double limit, double r
     p->lowest = INFINITY;
     if (is_known) return DONE;
     for (int k = 0; k < p->count; k++) {
-        if (p->listed[k].lower >= reach) continue;
-        if (contact(w, p, k, before, after, w->since, w->until)) return NO_VALUE;
+        double *contacts = p->contacts + w->each * w->size * p->near, *lower = &p->listed[k].lower, bound;
+        if (*lower >= reach) continue;
+        if (has_hull(w, p, k)) {
+            double gaps[2];
+            known_gaps(w, p, k, before, after, w->since, w->until, gaps);
+            if (gaps[0] >= floor && gaps[1] >= reach) {
+                p->lowest = least_of(p->lowest, gaps[0]);
+                *lower = gaps[1];
+                continue;
+            }
+        }
+        if (contact(w, p, k, before, after, w->since, w->until, contacts, &bound)) return NO_VALUE;
         /* The known normal may be old; the one at the start of this motion proves more. */
-        if (p->found[CONTACTS] < floor && p->listed[k].lower < floor
-            && (contact(w, p, k, before, before, w->since, w->since) || contact(w, p, k, before, after, w->since, w->until)))
+        if (bound < floor && *lower < floor
+            && (contact(w, p, k, before, before, w->since, w->since, contacts, &bound)
+                || contact(w, p, k, before, after, w->since, w->until, contacts, &bound)))
             return NO_VALUE;
-        memcpy(p->contacts + CONTACTS * p->near, p->found, CONTACTS * sizeof(double));
         /* The bound from the motion alone holds as well. */
-        double bound = p->found[CONTACTS] > p->listed[k].lower ? p->found[CONTACTS] : p->listed[k].lower;
-        p->lowest = least_of(p->lowest, bound);
-        p->listed[k].lower = p->found[0];
-        if (!(p->found[0] > 0.0)) p->overlaps = 1;
-        least = least_of(least, p->found[0]);
+        p->lowest = least_of(p->lowest, bound > *lower ? bound : *lower);
+        *lower = *contacts;
+        if (!(*contacts > 0.0)) p->overlaps = 1;
+        least = least_of(least, *contacts);
         p->rows[p->near++] = k;
     }
     p->is_close = least < limit;
@@ -601,4 +840,38 @@ static int see(Way *w, const double *place, double time, double limit, double se
 EXPORT int see_place(Way *w, double time, double limit, double self_limit)
 {
     return see(w, w->places, time, limit, self_limit);
+}
+
+/* Pairs with hulls, of which nothing else is known: the bodies (count), others (count), and numbers (count, width), which
+   begin with the points that span the body (4, 3), then those of the other body or the piece. Of each pair that is apart,
+   nearest points of the body and of the other, and the normal (count, 9). */
+typedef struct {
+    const Hulls *hulls;
+    Pairs *pairs;
+    int count, width;
+    const int *body, *other;
+    const double *numbers;
+    double *nearest;
+    int *is_apart;
+} Search;
+
+EXPORT int search(Search *s)
+{
+    for (int k = 0; k < s->count; k++) {
+        const double *points = s->numbers + s->width * k, *other = points + 3 * SPAN;
+        double *x = s->nearest + 9 * k, *normal = x + 6, gap;
+        int numbers[2] = {s->body[k], s->other[k]};
+        Convex sets[2];
+        Mean mean;
+        sets_of(s->hulls, s->pairs, numbers, points, other, sets, sets + 1);
+        normal[0] = normal[1] = 0.0;
+        normal[2] = 1.0;
+        int code = find_nearest(s->hulls, s->pairs, other, sets, sets + 1, normal, &gap, &mean);
+        if (code == NO_VALUE) return code;
+        s->is_apart[k] = code == DONE;
+        if (code) continue;
+        mean_of(mean.own[0], mean.weight, mean.count, x);
+        mean_of(mean.others[0], mean.weight, mean.count, x + 3);
+    }
+    return DONE;
 }

@@ -1,6 +1,6 @@
 /* A step of an arm in one call: near pairs, QP, settling, the checks of the new state and the proof of the way there.
 
-   It is for arms whose bodies are capsules, among pairs that a Way holds. The caller fills in goal and
+   It is for arms among pairs that a Way holds. The caller fills in goal and
    boxes among the arguments of the QP's function. A long arm's QP is a Chain's; then the Fused has the input, in the
    order of StepGraph.inputs, and names the places of the answer, but has no functions. Anything unusual ends the step with
    a code and leaves the state as it was; the caller then asks for a further QP, or takes the step by other means. */
@@ -66,11 +66,11 @@ typedef struct {
     double *points, *next_points;          /* (P, 3) those of the bodies; the nodes where they are the same */
     double *places;                        /* (MOST_PIECES + 1, P, 3) */
 
-    /* Rows of clearance: their contacts (R, 9), numbers of group and pair, in which round they were asked for, 0 in none,
-       and body, other and whether that is a body (R, 3); middle and span of the body and of the other body (R, 12), and
-       the answer (R, 7): a distance, a point of the body and one of the other. Counts of rounds, of rows asked for, and
-       of answers that were proven. */
-    int room, round, asked_for, proven;
+    /* Rows of clearance: their contacts (R, size), numbers of group and pair, in which round they were asked for, 0 in none
+       and -1 for a hull that presses, and body, other and whether that is a body (R, 3); middle and span of the body and of the other body (R, 12), and
+       the answer (R, 7): a distance, a point of the body and one of the other. Counts of rounds, of rows asked for, of
+       answers that were proven, and of rows of hulls that press. */
+    int room, round, asked_for, proven, unasked;
     double *contacts, *questions, *answers;
     int *group, *pair, *asked, *named;
 
@@ -115,16 +115,22 @@ static int over_nodes(StepData *s, int point, const double *part, int *nodes, do
     return DONE;
 }
 
+/* Contact k of the rows. */
+static double *contact_of(const StepData *s, int k)
+{
+    return s->contacts + s->way->size * k;
+}
+
 /* The row of contact k, see rows/clearance.py; of a QP that moves the arm, limited so that a zero step is allowed and
    pairs slow down. */
 static int clearance_row(StepData *s, int k)
 {
     Fused *f = s->fused;
-    const double *contact = s->contacts + CONTACT * k, *normal = contact + NORMAL;
+    const double *contact = contact_of(s, k), *normal = contact + normal_at(s->way);
     const Pairs *p = s->way->group[s->group[k]];
     int *nodes = f->near_nodes + s->slots * k;
     double *rows = f->near_rows + 3 * s->slots * k, part[3];
-    for (int i = 0; i < 4; i++) {
+    for (int i = 0; i < 2 * s->way->span; i++) {
         int point = point_of(s->way, p, s->pair[k], i);
         for (int a = 0; a < 3; a++) part[a] = contact[1 + i] * normal[a];
         if (s->end.eval) {
@@ -159,7 +165,7 @@ static int list_rows(StepData *s)
     Way *w = s->way;
     int count = 0;
     s->fused->slots = s->slots;
-    s->fused->near = s->round = s->asked_for = s->proven = 0;
+    s->fused->near = s->round = s->asked_for = s->proven = s->unasked = 0;
     if (!w) return DONE;
     int code = see(w, s->at, s->at_time, s->limit, s->self_limit);
     if (code) return code;
@@ -167,13 +173,13 @@ static int list_rows(StepData *s)
         const Pairs *p = w->group[g];
         double limit = p->is_self ? s->self_limit : s->limit;
         if (p->near && p->overlaps) return OVERLAPPING;
-        for (int i = 0; i < 2 * p->near; i++) {
-            const double *contact = p->contacts + CONTACT * i;
+        for (int i = 0; i < w->each * p->near; i++) {
+            const double *contact = p->contacts + w->size * i;
             if (!(contact[0] < limit)) continue;
             if (count == s->room) return CROWDED;
-            memcpy(s->contacts + CONTACT * count, contact, CONTACT * sizeof(double));
+            memcpy(contact_of(s, count), contact, w->size * sizeof(double));
             s->group[count] = g;
-            s->pair[count] = (int)p->rows[i >> 1];
+            s->pair[count] = (int)p->rows[i / w->each];
             s->named[3 * count] = p->listed[s->pair[count]].body;
             s->named[3 * count + 1] = p->listed[s->pair[count]].other;
             s->named[3 * count + 2] = p->is_self;
@@ -275,7 +281,7 @@ static const double *near_multipliers(const StepData *s)
 }
 
 /* Ask for the contacts of all rows, or of those that press: whose multipliers are not zero. Those that were asked for
-   before are left out; return whether there are others. */
+   before are left out, and those of hulls, which are counted; return whether there are others. */
 static int ask_for(StepData *s, int all)
 {
     Fused *f = s->fused;
@@ -285,12 +291,17 @@ static int ask_for(StepData *s, int all)
     for (int k = 0; k < f->near; k++) {
         if (s->asked[k] || !(all || fabs(multiplier[k]) > 0.0)) continue;
         const Pairs *p = s->way->group[s->group[k]];
+        if (has_hull(s->way, p, s->pair[k])) {
+            s->asked[k] = -1;
+            s->unasked++;
+            continue;
+        }
         double ends[6];
-        ends_for(s->way, p, s->pair[k], s->at, s->contacts + CONTACT * k, ends);
+        ends_for(s->way, p, s->pair[k], s->at, contact_of(s, k), ends);
         axis_of(ends, s->scale, s->questions + 12 * k);
         if (p->is_self) {
             for (int i = 0; i < 2; i++)
-                memcpy(ends + 3 * i, s->at + 3 * point_of(s->way, p, s->pair[k], 2 + i), 3 * sizeof(double));
+                memcpy(ends + 3 * i, s->at + 3 * point_of(s->way, p, s->pair[k], s->way->span + i), 3 * sizeof(double));
             axis_of(ends, s->scale, s->questions + 12 * k + 6);
         }
         s->asked[k] = s->round;
@@ -307,7 +318,7 @@ static int use_answers(StepData *s)
         double answer[7];
         for (int i = 0; i < 7; i++) answer[i] = s->answers[7 * k + i] / s->scale;
         Pairs *p = s->way->group[s->group[k]];
-        if (!prove(s->way, p, s->pair[k], answer, s->flaw, s->apart, s->contacts + CONTACT * k)) continue;
+        if (!prove(s->way, p, s->pair[k], answer, s->flaw, s->apart, contact_of(s, k))) continue;
         s->proven++;
         if (clearance_row(s, k)) return NO_VALUE;
     }

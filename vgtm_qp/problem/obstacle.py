@@ -192,7 +192,7 @@ class ClearanceTable(Table, called="[clearance]"):
     distance: Literal["fcl", "exact"] = Field(
         default="fcl",
         description="what gives the rows of pairs that can become active: FCL, each answer proven, or closed forms; "
-        "hulls have none, and are FCL's in both",
+        "those of hulls are searched, by our own C in both, by FCL without a compiler",
     )
     self_collision: Flag = Field(
         default=True, description="whether members that share no node keep apart too"

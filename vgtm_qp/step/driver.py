@@ -314,7 +314,10 @@ class Driver:
 
         data = self._arrays.data
         return ClearanceRows(
-            *work.near(near), name, data.proven, (data.asked_for if data.asks else near) - data.proven
+            *work.near(near),
+            name,
+            data.proven,
+            (data.asked_for + data.unasked if data.asks else near) - data.proven,
         )
 
     def _denied(self, state: State, target: Target, share: float) -> Step | None:

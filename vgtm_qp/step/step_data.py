@@ -9,7 +9,7 @@ import numpy as np
 
 from vgtm_qp.arm.arm import Arithmetic, Arm, Ends, tip_frame_function
 from vgtm_qp.arrays import Array
-from vgtm_qp.geometry.exact import CONTACT, NORMAL_FROM, PROOF
+from vgtm_qp.geometry.exact import NORMAL_FROM, PROOF
 from vgtm_qp.geometry.groups import Scene
 from vgtm_qp.geometry.watch import AHEAD
 from vgtm_qp.native import Program
@@ -38,8 +38,8 @@ LEAP = 1.0
 DEVIATION = 0.1
 """Greatest deviation of points from their chords in one step, over the arm's length."""
 
-_ROOM, _SLOTS = 64, 4
-"""Capacity at first: rows of clearance; points of a row."""
+_ROOM = 64
+"""Capacity at first: rows of clearance."""
 
 
 class StepData:
@@ -78,7 +78,10 @@ class StepData:
     ) -> None:
         arm = setup.arm
         self.program = Program("StepData")
-        self.data, self._work, self._ends = self.program.data, work, known.ends
+        self.data, self._work, scene = self.program.data, work, setup.monitor.scene
+        # A row is over the points of two bodies, each a function of three nodes where there are ends.
+        self._slots = 2 * scene.span * (1 if known.ends is None else 3)
+        self._size = scene.size
         self._hold_states(arm, layout)
         self.based_q, self.based_nodes = (self.before[part] for part in self.parts[:2])
         moves = setup.base_motion is not None
@@ -114,7 +117,8 @@ class StepData:
             **_of_arm(arm, known),
             must_track=int(layout.hard_tracking),
             **_of_tip(arm, layout),
-            **_of_fcl(setup.monitor.scene),
+            **_of_fcl(scene),
+            slots=self._slots,
             **of_points,
             **given,
         )
@@ -167,8 +171,8 @@ class StepData:
 
     def make_room(self, rows: int) -> None:
         """Make room for that many rows of clearance."""
-        self._work.reserve(rows, _SLOTS if self._ends is None else 3 * _SLOTS)
-        self.contacts, self.questions, self.answers = (np.zeros((rows, n)) for n in (CONTACT, 12, 7))
+        self._work.reserve(rows, self._slots)
+        self.contacts, self.questions, self.answers = (np.zeros((rows, n)) for n in (self._size, 12, 7))
         self.group, self.pair, self.asked = (np.zeros(rows, dtype=np.int32) for _ in range(3))
         self.named = np.zeros((rows, 3), dtype=np.int32)
         self.program.set(
@@ -232,7 +236,6 @@ def _of_points(arm: Arm, ends: Ends | None) -> dict[str, Any]:
     found: dict[str, Any] = {
         "places": np.zeros((MOST_PIECES + 1, *home.shape)),
         "span": home.size,
-        "slots": _SLOTS,
     }
     if ends is None:
         return found
@@ -244,5 +247,4 @@ def _of_points(arm: Arm, ends: Ends | None) -> dict[str, Any]:
         "end": ends.row,
         "end_nodes": np.ascontiguousarray(ends.nodes, dtype=np.int32),
         "offset": np.ascontiguousarray(ends.offset),
-        "slots": 3 * _SLOTS,
     }

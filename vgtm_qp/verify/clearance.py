@@ -7,10 +7,12 @@ halved.
 
 from __future__ import annotations
 
+import itertools
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,13 +89,21 @@ class RecordedMotion:
         """Return the name of a state."""
         return f"state {self.first + state}"
 
-    def ends_between(self, step: int, body: Index, share: Array) -> Array:
-        """Return (P, V, 3) the ends, m, of bodies (P,) at shares (P,) of the motion from state `step` to the next."""
-        return self.arm.ends_between(self.states[step], self.states[step + 1], share, body)
+    def ends_between(self, step: Index, body: Index, share: Array) -> Array:
+        """Return (P, V, 3) the ends, m, of bodies (P,) at shares (P,) of the ways from states (P,) to the next."""
+        found = np.empty((len(body), *self.ends.shape[2:]))
+        for k in np.unique(step).tolist():
+            own = np.flatnonzero(step == k)
+            found[own] = self.arm.ends_between(self.states[k], self.states[k + 1], share[own], body[own])
+        return found
 
-    def bend(self, step: int, body: Index) -> Array:
-        """Return (P,) an upper bound, m, of |d2 r / d share2| of bodies' ends in the motion from state `step`."""
-        return self.arm.bend(self.states[step], self.states[step + 1], body)
+    @cached_property
+    def bend(self) -> Array:
+        """(T - 1, M) upper bounds, m, of |d2 r / d share2| of bodies' ends on the ways from one state to the next."""
+        every = np.arange(len(self.arm.radius))
+        ways = itertools.pairwise(self.states)
+        found = [self.arm.bend(before, after, every) for before, after in ways]
+        return np.array(found).reshape(-1, len(every))
 
 
 @dataclass(frozen=True)
@@ -107,6 +117,21 @@ class Least:
         """Return the least of `values` with the place that `where` gives for its index, if it is lower."""
         k = int(np.argmin(values)) if len(values) else -1
         return Least(float(values[k]), where(k)) if k >= 0 and values[k] < self.value else self
+
+
+class _Instant(NamedTuple):
+    """Pairs (P,) at instants: their points (P, V or 2 V, 3), m, and normals (P, 3)."""
+
+    points: Array
+    normal: Array
+
+    def at(self, rows: Index) -> _Instant:
+        """Return some of the pairs."""
+        return _Instant(self.points[rows], self.normal[rows])
+
+    def joined(self, other: _Instant) -> _Instant:
+        """Return these pairs and others after them."""
+        return _Instant(*(np.concatenate(both) for both in zip(self, other, strict=True)))
 
 
 class Encounters(ABC):
@@ -136,10 +161,22 @@ class Encounters(ABC):
         """
 
     @abstractmethod
-    def separation(self, points: Array, pair: Pairs, near: Array | None = None) -> DistanceAndNormal:
+    def swept(self, before: Array, after: Array) -> Array:
+        """Return (P, 2 V or 4 V, 3) the points at two instants as those of bodies that have all of both."""
+
+    @abstractmethod
+    def separation(
+        self,
+        points: Array,
+        pair: Pairs,
+        near: Array | None = None,
+        enough: Array | float = np.inf,
+        *,
+        decides: bool = False,
+    ) -> DistanceAndNormal:
         """Return the exact surface distance (P,), m, and the normal (P, 3) at those points.
 
-        The search for those of hulls begins `near` (P, 3) the normals, if given.
+        See :func:`~vgtm_qp.verify.convex.hull_distance` for `near`, `enough` and `decides`, which are for hulls.
         """
 
     @abstractmethod
@@ -150,8 +187,8 @@ class Encounters(ABC):
         """
 
     @abstractmethod
-    def _bend(self, step: int, pair: Pairs) -> Array:
-        """Return (P,) bounds, m, of the pairs' second derivative, which comes from turning joints."""
+    def _bend(self, step: Index, pair: Pairs) -> Array:
+        """Return (P,) bounds, m, of the pairs' second derivative after states (P,), which comes from turning joints."""
 
     @abstractmethod
     def name(self, pair: tuple[int, int]) -> str:
@@ -170,31 +207,57 @@ class Encounters(ABC):
     def with_hull(self, pair: Pairs) -> NDArray[np.bool_]:
         """Return (P,) which of the pairs have a hull."""
 
-    def distances(self, state: int, pair: Pairs) -> Array:
-        """Return the exact distances (P,) of pairs at a state, m."""
-        ends, time = self.motion.ends[state], np.full(len(pair[0]), self.motion.time[state])
-        return self.separation(self.points(pair, lambda member: ends[member], time), pair)[0]
+    def distances(self, state: Index, pair: Pairs, enough: Array | float = np.inf) -> Array:
+        """Return the exact distances (P,) of pairs at states (P,), m; lower bounds of those that are `enough`."""
+        ends, time = self.motion.ends, self.motion.time[state]
+        points = self.points(pair, lambda member: ends[state, member], time)
+        return self.separation(points, pair, enough=enough)[0]
 
-    def at_state(self, state: int) -> Least:
-        """Return the exact least clearance at a state."""
-        ends = self.motion.ends[state]
-        low, high = ends.min(axis=1), ends.max(axis=1)
-        limit, least = self._first_limit(low, high, state), Least()
-        for pair in self._counting(low, high, state, state, limit):
-            least = least.or_lower(self.distances(state, pair), self._called(self.motion.name(state), pair))
+    def at_states(self) -> list[Least]:
+        """Return the exact least clearance at each state."""
+        count = len(self.motion.time)
+        limit, least = np.full(count, np.inf), [Least()] * count
+        for state, pair in self._together(self._first(k) for k in range(count)):
+            # Boxes along the axes may be exactly as far apart as the pair: rounding must not drop the pair.
+            np.minimum.at(limit, state, self.distances(state, pair) + self.motion.resolution)
+        for state, pair in self._together(self._at(k, k, limit[k]) for k in range(count)):
+            distance = self.distances(state, pair, limit[state])
+            order = np.lexsort((distance, state))
+            for k in order[np.unique(state[order], return_index=True)[1]].tolist():
+                at, one = int(state[k]), (pair[0][k : k + 1], pair[1][k : k + 1])
+                called = self._called(self.motion.name(at), one)
+                least[at] = least[at].or_lower(distance[k : k + 1], called)
         return least
 
-    def _first_limit(self, low: Array, high: Array, state: int) -> float:
-        """Return an upper bound of the least clearance, from the pairs that a growing limit meets first."""
+    def _at(self, start: int, stop: int, limit: float) -> Iterator[tuple[int, Pairs]]:
+        """Yield with a state the pairs that may be nearer than `limit`, m, there or on the way to `stop`."""
+        slack = self.motion.bend[start, :, None] / 8.0 if stop > start else 0.0
+        low, high = (corners[start : stop + 1] for corners in self.motion.boxes)
+        for pair in self._counting(low.min(axis=0) - slack, high.max(axis=0) + slack, start, stop, limit):
+            yield start, pair
+
+    def _first(self, state: int) -> Iterator[tuple[int, Pairs]]:
+        """Yield with a state some pairs that a growing limit meets first there."""
         reach = 0.05 * float(self.motion.arm.length.max())
         for _ in range(40):
-            pair = next(self._counting(low, high, state, state, reach), None)
-            if pair is not None:
-                # Boxes along the axes may be exactly as far apart as the pair: rounding must not drop the
-                # pair.
-                return float(self.distances(state, pair).min()) + self.motion.resolution
+            found = next(self._at(state, state, reach), None)
+            if found is not None:
+                yield found
+                return
             reach *= 2.0
-        return np.inf
+
+    def _together(self, each: Iterable[Iterable[tuple[int, Pairs]]]) -> Iterator[tuple[Index, Pairs]]:
+        """Yield pairs of many states together, as many as the memory has room for, with the state (P,) of each."""
+        most = _ENDS // (2 * 3 * self.motion.ends.shape[2])
+        some, size = list[tuple[int, Pairs]](), 0
+        for state, pair in itertools.chain.from_iterable(each):
+            if some and size + len(pair[0]) > most:
+                yield _joined(some)
+                some, size = [], 0
+            some.append((state, pair))
+            size += len(pair[0])
+        if some:
+            yield _joined(some)
 
     def _counting(self, low: Array, high: Array, start: int, stop: int, limit: float) -> Iterator[Pairs]:
         """Yield the pairs of `near` that count from state `start` on, some pairs at a time."""
@@ -210,33 +273,33 @@ class Encounters(ABC):
     def _called(self, when: str, pair: Pairs) -> Callable[[int], str]:
         return lambda k: f"{when}: {self.name((int(pair[0][k]), int(pair[1][k])))}"
 
-    def between(self, step: int, limit: Least, bound: Least) -> tuple[Least, Least]:
-        """Return `limit` and `bound` lowered by the motion from state `step` to the next.
+    def between(self, limit: Least, bound: Least) -> tuple[Least, Least]:
+        """Return `limit` and `bound` lowered by the motion from each state to the next.
 
         `limit` is the least clearance at any instant evaluated; `bound` is proven to be below every clearance
         in the steps so far, and comes within `RESOLUTION` of `limit`.
         """
-        ends = self.motion.ends[step : step + 2]
-        low, high = ends.min(axis=(0, 2)), ends.max(axis=(0, 2))
-        slack = self.motion.bend(step, np.arange(len(low)))[:, None] / 8.0
-        for pair in self._counting(low - slack, high + slack, step, step + 1, limit.value):
+        near = (self._at(step, step + 1, limit.value) for step in range(len(self.motion.time) - 1))
+        for step, pair in self._together(near):
             limit, bound = self.divide(step, pair, limit, bound)
         return limit, bound
 
-    def divide(self, step: int, pair: Pairs, limit: Least, bound: Least) -> tuple[Least, Least]:
-        """Return `limit` and `bound` lowered by pairs (P,), (P,) in the motion from state `step` to the next."""
-        start, width = np.zeros(len(pair[0])), 1.0
-        bend, near = self._bend(step, pair), None
+    def divide(self, step: Index, pair: Pairs, limit: Least, bound: Least) -> tuple[Least, Least]:
+        """Return `limit` and `bound` lowered by pairs (P,), (P,) on the ways from states `step` (P,) to the next."""
+        bend, width = self._bend(step, pair), 1.0
+        proven = self._held_throughout(step, pair, limit.value, bend / 8.0)
+        left = ~(proven >= limit.value)
+        called = self._called_between(step[~left], np.zeros(int((~left).sum())), _some(pair, ~left))
+        bound = bound.or_lower(proven[~left], called)
+        step, pair, bend, start = step[left], _some(pair, left), bend[left], np.zeros(int(left.sum()))
+        first, limit = self._edge(step, pair, start, np.zeros((len(start), 3)), limit)
+        last, limit = self._edge(step, pair, start + width, first.normal, limit)
         for depth in range(_GREATEST_DEPTH):
-            shares = (start, np.minimum(start + width, 1.0))
-            edges = [self._points_between(step, pair, share) for share in shares]
-            proven, normals = np.full(len(start), -np.inf), []
-            for points, share in zip(edges, shares, strict=True):
-                distance, normal = self.separation(points, pair, near)
-                normals.append(normal)
-                limit = limit.or_lower(distance, self._called_between(step, share, pair))
-                held = np.minimum(*(self.apart(ends, normal, pair) for ends in edges))
-                proven = np.maximum(proven, np.maximum(held - bend * width**2 / 8.0, self._floor(pair)))
+            held = [
+                np.minimum(*(self.apart(edge.points, normal, pair) for edge in (first, last)))
+                for normal in (first.normal, last.normal)
+            ]
+            proven = np.maximum(np.maximum(*held) - bend * width**2 / 8.0, self._floor(pair))
             open_ = (proven < limit.value - self.motion.resolution) & np.isfinite(bend)
             if depth == _GREATEST_DEPTH - 1 or open_.sum() > _GREATEST_COUNT:
                 open_[:] = False
@@ -245,19 +308,48 @@ class Encounters(ABC):
             if not open_.any():
                 break
             width /= 2.0
-            start = np.concatenate([start[open_], start[open_] + width])
-            pair = (np.tile(pair[0][open_], 2), np.tile(pair[1][open_], 2))
-            bend, near = np.tile(bend[open_], 2), np.concatenate([normal[open_] for normal in normals])
+            rows = np.flatnonzero(open_)
+            first, last, step, pair = first.at(rows), last.at(rows), step[rows], _some(pair, rows)
+            middle, limit = self._edge(step, pair, start[rows] + width, first.normal, limit)
+            first, last = _Instant.joined(first, middle), _Instant.joined(middle, last)
+            start = np.concatenate([start[rows], start[rows] + width])
+            step, bend, pair = (
+                np.tile(step, 2),
+                np.tile(bend[rows], 2),
+                (np.tile(pair[0], 2), np.tile(pair[1], 2)),
+            )
         return limit, bound
 
-    def _points_between(self, step: int, pair: Pairs, share: Array) -> Array:
-        before, after = self.motion.time[step : step + 2]
+    def _held_throughout(self, step: Index, pair: Pairs, limit: float, bend: Array) -> Array:
+        """Return (P,) lower bounds, m, of the distances of pairs in the whole of steps (P,), if they have a hull.
+
+        One plane may hold apart all that a pair sweeps over, by more than the `limit` and the `bend` (P,) of its way.
+        Of other pairs, and where there is no such plane, the bound is below the limit.
+        """
+        found, rows = np.full(len(bend), -np.inf), np.flatnonzero(self.with_hull(pair))
+        if len(rows):
+            step, pair, enough = step[rows], _some(pair, rows), limit + bend[rows]
+            ends = [self._points_between(step, pair, np.full(len(rows), share)) for share in (0.0, 1.0)]
+            gap, _ = self.separation(self.swept(*ends), pair, None, enough, decides=True)
+            found[rows] = gap - bend[rows]
+        return found
+
+    def _edge(
+        self, step: Index, pair: Pairs, share: Array, near: Array, limit: Least
+    ) -> tuple[_Instant, Least]:
+        """Return pairs (P,) at shares (P,) of steps, and `limit` lowered by them; the search begins `near` normals."""
+        points = self._points_between(step, pair, share)
+        distance, normal = self.separation(points, pair, near)
+        return _Instant(points, normal), limit.or_lower(distance, self._called_between(step, share, pair))
+
+    def _points_between(self, step: Index, pair: Pairs, share: Array) -> Array:
+        before, after = self.motion.time[step], self.motion.time[step + 1]
         time = before + share * (after - before)
         return self.points(pair, lambda member: self.motion.ends_between(step, member, share), time)
 
-    def _called_between(self, step: int, share: Array, pair: Pairs) -> Callable[[int], str]:
-        number = self.motion.first + step + 1
-        return lambda k: self._called(f"step {number} at {share[k]:.4f}", pair)(k)
+    def _called_between(self, step: Index, share: Array, pair: Pairs) -> Callable[[int], str]:
+        first = self.motion.first + 1
+        return lambda k: self._called(f"step {first + step[k]} at {share[k]:.4f}", pair)(k)
 
 
 class AgainstBody(Encounters):
@@ -291,29 +383,45 @@ class AgainstBody(Encounters):
         ]
         return np.repeat(member, [len(found) for found in near]), np.concatenate(near)
 
-    def at_state(self, state: int) -> Least:
-        """Return the exact least clearance at a state; what is inside a closed mesh touches, hulls by their length."""
+    def at_states(self) -> list[Least]:
+        """Return the exact least clearances; what is inside a closed mesh touches, hulls by their length."""
+        return [least.or_lower(*self._depth(state)) for state, least in enumerate(super().at_states())]
+
+    def _depth(self, state: int) -> tuple[Array, Callable[[int], str]]:
+        """Return (M,) distances, m, of members inside a closed mesh at a state, infinite for others; and names."""
         arm, ends = self.motion.arm, self.motion.ends[state] - self._centers[state]
         inside = self.body.encloses(ends.reshape(-1, 3)).reshape(len(ends), -1).any(axis=1)
         depth = np.where(inside, -np.where(arm.is_hull, arm.length, 0.0) - arm.radius, np.inf)
-        return (
-            super()
-            .at_state(state)
-            .or_lower(depth, lambda k: f"{self.motion.name(state)}: {self.name((k, 0))}")
-        )
+        return depth, lambda k: f"{self.motion.name(state)}: {self.name((k, 0))}"
 
     def points(self, pair: Pairs, ends: Callable[[Index], Array], time: Array) -> Array:
         """Return (P, V, 3) the ends of the members, seen from the centre of the body."""
         return np.asarray(ends(pair[0]) - self.body.at(time)[:, None])
 
-    def separation(self, points: Array, pair: Pairs, near: Array | None = None) -> DistanceAndNormal:
+    def swept(self, before: Array, after: Array) -> Array:
+        """See ``Encounters``."""
+        return np.concatenate([before, after], axis=1)
+
+    def separation(
+        self,
+        points: Array,
+        pair: Pairs,
+        near: Array | None = None,
+        enough: Array | float = np.inf,
+        *,
+        decides: bool = False,
+    ) -> DistanceAndNormal:
         """Return surface distances and normals."""
+        radius = self.motion.arm.radius[pair[0]]
+        least = enough + radius
         distance, normal = of_each(
             self.with_hull(pair),
             lambda k: self.body.separation(points[k, 0], points[k, 1], pair[1][k]),
-            lambda k: self.body.hull_separation(points[k], pair[1][k], None if near is None else near[k]),
+            lambda k: self.body.hull_separation(
+                points[k], pair[1][k], None if near is None else near[k], least[k], decides=decides
+            ),
         )
-        return distance - self.motion.arm.radius[pair[0]], normal
+        return distance - radius, normal
 
     def apart(self, points: Array, normal: Array, pair: Pairs) -> Array:
         """Return the gaps between members and pieces."""
@@ -324,8 +432,8 @@ class AgainstBody(Encounters):
         """See ``Encounters``."""
         return np.asarray(self.motion.arm.is_hull[pair[0]])
 
-    def _bend(self, step: int, pair: Pairs) -> Array:
-        return self.motion.bend(step, pair[0])
+    def _bend(self, step: Index, pair: Pairs) -> Array:
+        return np.asarray(self.motion.bend[step, pair[0]])
 
     def name(self, pair: tuple[int, int]) -> str:
         """Return ``member / obstacle``."""
@@ -379,10 +487,26 @@ class AgainstMembers(Encounters):
         """Return (P, 2 V, 3) the ends of both members."""
         return np.concatenate([ends(member) for member in pair], axis=1)
 
-    def separation(self, points: Array, pair: Pairs, near: Array | None = None) -> DistanceAndNormal:
+    def swept(self, before: Array, after: Array) -> Array:
+        """See ``Encounters``."""
+        count = before.shape[1] // 2
+        return np.concatenate(
+            [at[:, own] for own in (slice(count), slice(count, None)) for at in (before, after)], 1
+        )
+
+    def separation(
+        self,
+        points: Array,
+        pair: Pairs,
+        near: Array | None = None,
+        enough: Array | float = np.inf,
+        *,
+        decides: bool = False,
+    ) -> DistanceAndNormal:
         """Return surface distances and normals."""
-        distance, normal = body_distance(points, self.with_hull(pair), near)
-        return distance - self.radii(pair), normal
+        radii = self.radii(pair)
+        distance, normal = body_distance(points, self.with_hull(pair), near, enough + radii, decides=decides)
+        return distance - radii, normal
 
     def apart(self, points: Array, normal: Array, pair: Pairs) -> Array:
         """Return the gaps between both members."""
@@ -393,8 +517,8 @@ class AgainstMembers(Encounters):
         """See ``Encounters``."""
         return np.asarray(self.motion.arm.is_hull[np.stack(pair)].any(axis=0))
 
-    def _bend(self, step: int, pair: Pairs) -> Array:
-        return self.motion.bend(step, pair[0]) + self.motion.bend(step, pair[1])
+    def _bend(self, step: Index, pair: Pairs) -> Array:
+        return np.asarray(self.motion.bend[step, pair[0]] + self.motion.bend[step, pair[1]])
 
     def name(self, pair: tuple[int, int]) -> str:
         """Return ``member / member``."""
@@ -416,13 +540,20 @@ def apart_at_home(arm: AnyRecordedArm, resolution: float) -> list[str]:
     return [f"{names[a]} / {names[b]} do not touch at home" for a, b in arm.touching[apart].tolist()]
 
 
-def body_distance(points: Array, hull: NDArray[np.bool_], near: Array | None = None) -> DistanceAndNormal:
+def body_distance(
+    points: Array,
+    hull: NDArray[np.bool_],
+    near: Array | None = None,
+    enough: Array | float = np.inf,
+    *,
+    decides: bool = False,
+) -> DistanceAndNormal:
     """Return distances (P,), m, and normals (P, 3) between two bodies of the arm each, without their radii.
 
-    `points` (P, 2 V, 3) are the ends or vertices of both; `hull` (P,) says where at least one of them is a hull,
-    and `near` (P, 3) where the normals of these are searched first, if known.
+    `points` (P, 2 V, 3) are the ends or vertices of both; `hull` (P,) says where at least one of them is a hull. See
+    :func:`~vgtm_qp.verify.convex.hull_distance` for `near`, `enough` and `decides`.
     """
-    count = points.shape[1] // 2
+    count, enough = points.shape[1] // 2, np.broadcast_to(enough, len(points))
 
     def hulls(own: Index) -> DistanceAndNormal:
         others = points[own, count:]
@@ -431,10 +562,23 @@ def body_distance(points: Array, hull: NDArray[np.bool_], near: Array | None = N
             corner = np.einsum("pvc,pc->pv", others[rows], direction).argmax(axis=1)
             return np.asarray(others[rows, corner])
 
-        return hull_distance(points[own, :count], furthest, None if near is None else near[own])
+        hint = None if near is None else near[own]
+        return hull_distance(points[own, :count], furthest, hint, enough[own], decides=decides)
 
     ends = (0, 1, count, count + 1)
     return of_each(hull, lambda own: segment_segment(*(points[own, k] for k in ends)), hulls)
+
+
+def _joined(each: Sequence[tuple[int, Pairs]]) -> tuple[Index, Pairs]:
+    """Return the states (P,) and the pairs (P,), (P,) of all entries, one entry after another."""
+    states = np.repeat([state for state, _ in each], [len(pair[0]) for _, pair in each])
+    first, second = (np.concatenate([pair[k] for _, pair in each]) for k in (0, 1))
+    return states, (first, second)
+
+
+def _some(pair: Pairs, rows: Index | NDArray[np.bool_]) -> Pairs:
+    """Return some of the pairs."""
+    return pair[0][rows], pair[1][rows]
 
 
 def box_gap(low: Array, high: Array, other_low: Array, other_high: Array) -> Array:

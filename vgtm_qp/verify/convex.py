@@ -53,14 +53,23 @@ def of_each(
     return distance, normal
 
 
-def hull_distance(vertices: Array, furthest: Furthest, near: Array | None = None) -> DistanceAndNormal:
+def hull_distance(
+    vertices: Array,
+    furthest: Furthest,
+    near: Array | None = None,
+    enough: Array | float = np.inf,
+    *,
+    decides: bool = False,
+) -> DistanceAndNormal:
     """Return the distances (P,), m, of hulls with `vertices` (P, V, 3) from other bodies, and normals (P, 3).
 
-    The search is short where it begins `near` (P, 3) the normals; zero where these are unknown.
+    The search is short where it begins `near` (P, 3) the normals; zero where these are unknown. It ends where a gap is
+    `enough`, one or (P,), and if it only `decides` whether there is one, where there is none: gaps are returned then,
+    which are lower bounds of distances.
     Where they overlap, the distance is minus a bound of the least translation that parts them, and the normal its way.
     """
     count = len(vertices)
-    every = np.arange(count)
+    every, enough = np.arange(count), np.broadcast_to(enough, count)
     lower, best = np.full(count, -np.inf), np.zeros((count, 3))
     overlap = np.zeros(count, dtype=np.bool_)
     direction = np.zeros((count, 3)) if near is None else near.copy()
@@ -87,7 +96,9 @@ def hull_distance(vertices: Array, furthest: Furthest, near: Array | None = None
             break
         apart = look(normal, rows)
         size = np.abs(apart).max(axis=1)
-        going = ~(upper - lower[rows] <= _EXACT * size)
+        going = ~(upper - lower[rows] <= _EXACT * size) & ~(lower[rows] >= enough[rows])
+        if decides:
+            going &= upper >= enough[rows]
         rows, corners, used, apart, size, upper = (
             x[going] for x in (rows, corners, used, apart, size, upper)
         )
@@ -110,8 +121,10 @@ def hull_distance(vertices: Array, furthest: Furthest, near: Array | None = None
         every_corner = np.concatenate([apart[:, None], corners], axis=1)[going]
         corners = np.take_along_axis(every_corner, order[..., None], axis=1)
         used = np.take_along_axis(kept, order, axis=1)
+    if decides:
+        return lower, best
     overlap &= lower <= 0.0
-    for k in np.flatnonzero(~overlap & (reached - lower > _FINISHED * sizes)).tolist():
+    for k in np.flatnonzero(~overlap & (lower < enough) & (reached - lower > _FINISHED * sizes)).tolist():
         _finish(look, best[k], every[k : k + 1])
     lower[overlap], best[overlap] = _way_out(vertices[overlap], furthest, every[overlap])
     return lower, best

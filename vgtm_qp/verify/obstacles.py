@@ -46,12 +46,29 @@ class Shape:
         """Return the greatest ``normal . x`` (P,) over the points x of pieces of `sizes` for normals (P, 3), m."""
         return np.asarray(np.einsum("pc,pc->p", normal, self.furthest(normal, sizes)))
 
-    def hull_distance(self, vertices: Array, sizes: Array, near: Array | None = None) -> DistanceAndNormal:
-        """Return distances (P,) and normals (P, 3) of hulls of `vertices` (P, V, 3) against pieces of `sizes`."""
+    def hull_distance(
+        self,
+        vertices: Array,
+        sizes: Array,
+        near: Array | None = None,
+        enough: Array | float = np.inf,
+        *,
+        decides: bool = False,
+    ) -> DistanceAndNormal:
+        """Return distances (P,) and normals (P, 3) of hulls of `vertices` (P, V, 3) against pieces of `sizes`.
+
+        See :func:`~vgtm_qp.verify.convex.hull_distance` for `near`, `enough` and `decides`.
+        """
         if self.furthest is _ball_furthest:
-            distance, normal = hull_distance(vertices, lambda normal, _: np.zeros_like(normal), near)
+            distance, normal = hull_distance(
+                vertices, lambda normal, _: np.zeros_like(normal), near, enough + sizes, decides=decides
+            )
             return distance - sizes, normal
-        return hull_distance(vertices, lambda normal, rows: self.furthest(normal, sizes[rows]), near)
+
+        def furthest(normal: Array, rows: Index) -> Array:
+            return self.furthest(normal, sizes[rows])
+
+        return hull_distance(vertices, furthest, near, enough, decides=decides)
 
 
 _BOX_CORNERS: Array = np.array([list(itertools.product((-1.0, 1.0), repeat=3))])
@@ -132,13 +149,22 @@ class Body:
         distance, normal = self.shape.distance(start, end, self.shape.sizes[piece])
         return distance, normal @ self.rotation.T
 
-    def hull_separation(self, vertices: Array, piece: Index, near: Array | None = None) -> DistanceAndNormal:
+    def hull_separation(
+        self,
+        vertices: Array,
+        piece: Index,
+        near: Array | None = None,
+        enough: Array | float = np.inf,
+        *,
+        decides: bool = False,
+    ) -> DistanceAndNormal:
         """Return distances and normals of P convex hulls of `vertices` (P, V, 3) against the pieces (P,).
 
-        See :func:`~vgtm_qp.verify.convex.hull_distance` for `near`.
+        See :func:`~vgtm_qp.verify.convex.hull_distance` for `near`, `enough` and `decides`.
         """
         near = None if near is None else near @ self.rotation
-        distance, normal = self.shape.hull_distance(vertices @ self.rotation, self.shape.sizes[piece], near)
+        own, sizes = vertices @ self.rotation, self.shape.sizes[piece]
+        distance, normal = self.shape.hull_distance(own, sizes, near, enough, decides=decides)
         return distance, normal @ self.rotation.T
 
     def support(self, normal: Array, piece: Index) -> Array:

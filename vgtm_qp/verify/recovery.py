@@ -37,8 +37,11 @@ def excuse_recovering(
             index = (np.array([pair[0] for pair in pairs]), np.array([pair[1] for pair in pairs]))
             # However deep an axis or a hull is inside, its distance here is minus the radius.
             deepest = float(group.deepest(index).min())
-            distance = np.array([group.distances(k, index).min() for k in range(len(group.motion.time))])
-            distance = np.maximum(distance, deepest)
+            states = np.repeat(np.arange(len(group.motion.time)), len(pairs))
+            every = group.distances(
+                states, (np.resize(index[0], len(states)), np.resize(index[1], len(states)))
+            )
+            distance = np.maximum(every.reshape(-1, len(pairs)).min(axis=1), deepest)
             kept = np.flatnonzero(distance >= floor - CLEARANCE_TOLERANCE)
             since = int(kept[0]) if len(kept) else len(distance)
             off = distance[0] - max(wanted[name], deepest)
@@ -81,7 +84,7 @@ def _nearer(group: Encounters, pairs: Pairs, name: str, distance: Array, floor: 
             wrong.append(
                 f"recovered: {name} is {distance[state + 1]:.9g} m apart at {where} after {least:.9g} m"
             )
-        limit, bound = group.divide(state, pairs, Least(), Least())
+        limit, bound = group.divide(np.full(len(pairs[0]), state), pairs, Least(), Least())
         least_between = max(min(limit.value, bound.value), float(group.deepest(pairs).min()))
         if least_between < least - BETWEEN_TOLERANCE * group.motion.arm.size:
             step = group.motion.first + state + 1

@@ -161,15 +161,12 @@ def least_measure(found: Least, bound: float, unit: str = "m") -> Measure:
 def _least_clearances(motion: RecordedMotion, encounters: Sequence[Encounters]) -> tuple[Least, Least, Array]:
     """Return the least clearance at states, a bound of it between them, and the least at each state (T,)."""
     count = len(motion.time)
-    each = [
-        min((pairs.at_state(state) for pairs in encounters), key=lambda least: least.value, default=Least())
-        for state in range(count)
-    ]
+    found = zip(*(pairs.at_states() for pairs in encounters), strict=True) if encounters else [()] * count
+    each = [min(at, key=lambda least: least.value, default=Least()) for at in found]
     at = min(each, key=lambda least: least.value)
     limit, bound = at, Least()
-    for step in range(count - 1):
-        for pairs in encounters:
-            limit, bound = pairs.between(step, limit, bound)
+    for pairs in encounters:
+        limit, bound = pairs.between(limit, bound)
     # The bound names an interval. If the clearance found is as low, its instant is more precise.
     where = limit.where if bound.value >= limit.value - motion.resolution else bound.where
     between = Least(min(bound.value, limit.value), where)
