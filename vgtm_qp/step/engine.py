@@ -145,7 +145,7 @@ class Engine(ABC):
 Missing = Callable[[Closed, CurvePoint], tuple[Array, float]]
 """Returns the errors of the equalities that are settled, and their norm, m."""
 
-Correct = Callable[[Array, CurvePoint, Array], tuple[Array, CurvePoint] | None]
+Correction = Callable[[Array, CurvePoint, Array], tuple[Array, CurvePoint] | None]
 """Returns configuration and curve corrected by errors; None where nothing can correct these."""
 
 
@@ -155,7 +155,7 @@ def settled(
     accuracy: Accuracy,
     close: Callable[[Array], Closed],
     missing: Missing,
-    correct: Correct,
+    correct: Correction,
     most: int,
 ) -> Settled | None:
     """Return where a configuration and its curve are led by closing and by at most that many corrections, in turn."""
