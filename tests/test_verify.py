@@ -355,6 +355,22 @@ def test_bound_between_states_is_below_every_instant_and_close(
     assert len(motion.ends) == 2
 
 
+def test_a_long_recording_is_bounded_as_closely_as_a_short_one(
+    monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator
+) -> None:
+    """The greatest count of intervals is for one step, however many are divided at once."""
+    truss = tripod()
+    there, back = truss.home + rng.normal(scale=0.05, size=(2, 5, 3))
+    bounds = []
+    for times, greatest in ((1, 400_000), (300, 400_000), (300, 40)):
+        monkeypatch.setattr(sys.modules[RecordedMotion.__module__], "GREATEST_COUNT", greatest)
+        motion, pairs = encounters(truss, np.array([there, back] * times), [])
+        limit, bound = pairs[-1].between(Least(pairs[-1].at_states()[0].value), Least())
+        assert bound.value >= limit.value - motion.resolution
+        bounds.append(bound.value)
+    assert bounds[1:] == pytest.approx([bounds[0]] * 2, abs=motion.resolution)
+
+
 def frozen(pair: Any, nodes: Any, share: float) -> float:
     """Clearance of one instant, over all pairs without any culling."""
     ends = pair.motion.arm.ends(nodes)

@@ -153,7 +153,8 @@ static int approach(const Convex *body, const Convex *other, double unit, double
         for (int a = 0; a < 3; a++) along[a] = (x[a] - y[a]) / nearer;
         *m = next;
     }
-    return DONE;
+    /* There is none where squares of distances are infinite. */
+    return m->count ? DONE : NO_VALUE;
 }
 
 /* How far the points (4) that span a hull before and after a motion move along a vector. */

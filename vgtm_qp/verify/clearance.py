@@ -34,8 +34,8 @@ RESOLUTION = 1e-6
 """Greatest gap between bound and least clearance found between states, over the same mean length."""
 
 _GREATEST_DEPTH = 48
-_GREATEST_COUNT = 400_000
-"""Greatest numbers of halvings, and of open intervals; beyond, a bound stays as it is."""
+GREATEST_COUNT = 400_000
+"""Greatest numbers of halvings, and of open intervals of one step; beyond, a bound stays as it is."""
 _CHUNK = 200_000
 _ENDS = 3_000_000
 """Number of coordinates of ends that are in the memory at a time."""
@@ -286,26 +286,57 @@ class Encounters(ABC):
 
     def divide(self, step: Index, pair: Pairs, limit: Least, bound: Least) -> tuple[Least, Least]:
         """Return `limit` and `bound` lowered by pairs (P,), (P,) on the ways from states `step` (P,) to the next."""
-        bend, width = self._bend(step, pair), 1.0
+        bend = self._bend(step, pair)
         proven = self._held_throughout(step, pair, limit.value, bend / 8.0)
         left = ~(proven >= limit.value)
         called = self._called_between(step[~left], np.zeros(int((~left).sum())), _some(pair, ~left))
         bound = bound.or_lower(proven[~left], called)
         step, pair, bend, start = step[left], _some(pair, left), bend[left], np.zeros(int(left.sum()))
         first, limit = self._edge(step, pair, start, np.zeros((len(start), 3)), limit)
-        last, limit = self._edge(step, pair, start + width, first.normal, limit)
-        for depth in range(_GREATEST_DEPTH):
+        last, limit = self._edge(step, pair, start + 1.0, first.normal, limit)
+        return self._halve(0, first, last, step, pair, bend, start, limit, bound)
+
+    def _halve(
+        self,
+        depth: int,
+        first: _Instant,
+        last: _Instant,
+        step: Index,
+        pair: Pairs,
+        bend: Array,
+        start: Array,
+        limit: Least,
+        bound: Least,
+    ) -> tuple[Least, Least]:
+        """Go on with :meth:`divide` from intervals (P,), which begin at shares `start` (P,) of their steps."""
+        for halvings in range(depth, _GREATEST_DEPTH):
+            width = 0.5**halvings
             held = [
                 np.minimum(*(self.apart(edge.points, normal, pair) for edge in (first, last)))
                 for normal in (first.normal, last.normal)
             ]
             proven = np.maximum(np.maximum(*held) - bend * width**2 / 8.0, self._floor(pair))
             open_ = (proven < limit.value - self.motion.resolution) & np.isfinite(bend)
-            if depth == _GREATEST_DEPTH - 1 or open_.sum() > _GREATEST_COUNT:
+            is_much, steps = open_.sum() > GREATEST_COUNT, np.unique(step[open_])
+            if halvings == _GREATEST_DEPTH - 1 or (is_much and len(steps) == 1):
                 open_[:] = False
             settled = np.where(open_, np.inf, proven)
             bound = bound.or_lower(settled, self._called_between(step, start, pair))
             if not open_.any():
+                break
+            if is_much:
+                # The greatest count is for one step; those of many are divided apart.
+                for own in (step < steps[len(steps) // 2], step >= steps[len(steps) // 2]):
+                    rows = np.flatnonzero(open_ & own)
+                    parts = (
+                        first.at(rows),
+                        last.at(rows),
+                        step[rows],
+                        _some(pair, rows),
+                        bend[rows],
+                        start[rows],
+                    )
+                    limit, bound = self._halve(halvings, *parts, limit, bound)
                 break
             width /= 2.0
             rows = np.flatnonzero(open_)
