@@ -608,7 +608,10 @@ def test_bounds_of_the_certificate_hold_at_every_instant_and_are_close(seed):
     rng = np.random.default_rng(seed)
     problem = hulled_arm(rng)
     arm, (bodies, _, _) = vq.Certifier(problem).arm, read_obstacles(problem.to_dict(), None, Path())
-    states = np.cumsum(rng.normal(scale=0.25, size=(5, 10)), axis=0) * (np.arange(10) < 4)
+    # Some steps are so long that the arm comes near on the way and is far at both ends, some fold it past itself.
+    states = rng.normal(scale=rng.choice([0.3, 1.5]), size=(5, 10)) * (np.arange(10) < 4)
+    if rng.random() < 0.5:
+        states[:, 2:4] = [[0.8, 2.3], [-0.8, 2.3]] * 2 + [[0.8, 2.3]] + 0.2 * rng.normal(size=(5, 2))
     motion = RecordedMotion(arm, np.arange(5.0), states)
     count, dense = len(arm.radius), np.linspace(0.0, 4.0, 201)
     step = np.minimum(dense.astype(int), 3)
@@ -625,7 +628,8 @@ def test_bounds_of_the_certificate_hold_at_every_instant_and_are_close(seed):
         least = group.at_states()
         np.testing.assert_allclose([one.value for one in least], sampled[::50], rtol=0.0, atol=1e-9)
         limit, bound = group.between(min(least, key=lambda one: one.value), Least())
-        assert min(bound.value, limit.value) <= sampled.min() + 1e-12
+        # Of bodies that overlap only that is known.
+        assert min(bound.value, limit.value) <= max(sampled.min(), 0.0) + 1e-12
         if sampled.min() > 0.01:
             assert limit.value <= sampled.min() + motion.resolution
             assert bound.value >= limit.value - motion.resolution - 1e-12

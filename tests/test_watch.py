@@ -363,3 +363,22 @@ def test_a_way_in_pieces_is_proven_where_each_piece_is(rng):
             way = start + np.cumsum(rng.normal(scale=0.4, size=(6, 1, 3)), axis=0)
             pieces = [monitor.along(np.stack(piece), 0.0, 0.0, 0.08).certified for piece in pairwise(way)]
             assert monitor.along(way, 0.0, 1.0, 0.08).certified == all(pieces)
+
+
+@pytest.mark.parametrize("bad", range(4))
+def test_a_way_is_refused_for_the_one_piece_that_leads_through_something(bad):
+    """To and fro beside a wall, in one piece through it and back: the pieces before are proven by the watch."""
+    wall = box("wall", [1.0, 0.0, 0.0], [0.1, 0.1, 4.0])
+    start = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    sides = np.cumsum([[0.0, 1.0, 0.0], *[[0.0, 0.2, 0.0]] * 4], axis=0)
+    sides[bad + 1 :] += [2.0, 0.0, 0.0]
+    sides[: bad + 1, 1], sides[bad + 1 :, 1] = sides[: bad + 1, 1] - sides[bad, 1], 0.2 * np.arange(4 - bad)
+    for watch in (True, False):
+        monitor = Clearance(
+            capsules([(0, 1)], 0.03), [wall], safe=0.08, influence=0.5, self_collision=False, watch=watch
+        )
+        report = monitor.along(start + sides[:, None], 0.0, 1.0, 0.08)
+        assert not report.certified
+        assert 0.25 * bad < report.fraction[0] <= 0.25 * (bad + 1)
+        for piece in set(range(4)) - {bad}:
+            assert monitor.along(start + sides[piece : piece + 2, None], 0.0, 1.0, 0.08).certified

@@ -500,8 +500,8 @@ static int sharpen(const Hulls *h, Pairs *p, const double *piece, const Convex *
     mean_of(body->points, body->weights + SPAN * last, SPAN, ends + 3);
     if (touch(p, ends, piece)) return NO_VALUE;
     double found = gap_along(body, other, p->found + CONTACT - 4, own, others, vertex);
-    /* Another edge may be nearer, or the axis cut the piece. */
-    if (!(found >= *p->found - EXACT * (h->unit + *p->found))) return DONE;
+    /* A search that ended early may have another edge. */
+    if (!(found >= *gap - EXACT * (h->unit + fabs(*gap)))) return DONE;
     *gap = found;
     memcpy(normal, p->found + CONTACT - 4, 3 * sizeof(double));
     m->count = 2;

@@ -64,12 +64,12 @@ def hull_distance(
     """Return the distances (P,), m, of hulls with `vertices` (P, V, 3) from other bodies, and normals (P, 3).
 
     The search is short where it begins `near` (P, 3) the normals; zero where these are unknown. It ends where a gap is
-    `enough`, one or (P,), and if it only `decides` whether there is one, where there is none: gaps are returned then,
-    which are lower bounds of distances.
+    `enough`, one or (P,), and not below zero, and if it only `decides` whether there is one, where there is none: gaps
+    are returned then, which are lower bounds of distances.
     Where they overlap, the distance is minus a bound of the least translation that parts them, and the normal its way.
     """
     count = len(vertices)
-    every, enough = np.arange(count), np.broadcast_to(enough, count)
+    every, enough = np.arange(count), np.broadcast_to(np.maximum(enough, 0.0), count)
     lower, best = np.full(count, -np.inf), np.zeros((count, 3))
     overlap = np.zeros(count, dtype=np.bool_)
     direction = np.zeros((count, 3)) if near is None else near.copy()
