@@ -439,18 +439,23 @@ def test_the_watch_has_the_rows_of_the_lists(seed, fastest):
 @given(seeds, st.sampled_from([0.0, 0.5]))
 def test_what_the_watch_proves_of_hulls_holds_at_every_instant(seed, fastest):
     scene = Scene(seed, "c", meshes=False, fastest=fastest)
-    watch, proven, shares = scene.monitor.watching(), 0, np.linspace(0.0, 1.0, 51)
-    states = list(walk(scene, 8, 0.15))
-    for (start, since), (end, until) in itertools.pairwise(states):
-        contacts = scene.near(start, since)
+    watch, shares = scene.monitor.watching(), np.linspace(0.0, 1.0, 51)
+    for (start, since), (end, until) in itertools.pairwise(walk(scene, 8, 0.15)):
+        contacts = scene.near(start, since, tracked=True)
+        if not contacts.distance.min() > 0.0:
+            break
         pairs = {contacts.pair(k) for k in range(len(contacts)) if contacts.body[k] != 3}
         way, times = start + shares[:, None, None] * (end - start), since + shares * (until - since)
         sampled = min(other_distances(scene, way, pair, times).min() for pair in pairs)
+        # A tenth of the way is so short that the motion alone bounds the distance.
+        nearer = 0.1 * (2.0 * np.linalg.norm(end - start, axis=1).max() + fastest * (until - since) * 2.0)
+        certain = contacts.distance.min() - nearer
+        if certain > 0.0:
+            here, then = start + 0.1 * (end - start), since + 0.1 * (until - since)
+            assert watch.follow(np.stack([start, here]), since, then, certain, certain)
         for floor in (0.9 * sampled, sampled + 1e-3) if sampled > 0.0 else ():
             is_proven = watch.follow(np.stack([start, end]), since, until, floor, floor)
             assert not (is_proven and floor > sampled)
-            proven += is_proven
-    assert proven or min(scene.monitor.least(X, time)[0] for X, time in states) < 0.05
 
 
 @needs_c

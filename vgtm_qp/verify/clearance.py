@@ -344,11 +344,8 @@ class Encounters(ABC):
             middle, limit = self._edge(step, pair, start[rows] + width, first.normal, limit)
             first, last = _Instant.joined(first, middle), _Instant.joined(middle, last)
             start = np.concatenate([start[rows], start[rows] + width])
-            step, bend, pair = (
-                np.tile(step, 2),
-                np.tile(bend[rows], 2),
-                (np.tile(pair[0], 2), np.tile(pair[1], 2)),
-            )
+            step, bend = np.tile(step, 2), np.tile(bend[rows], 2)
+            pair = np.tile(pair[0], 2), np.tile(pair[1], 2)
         return limit, bound
 
     def _held_throughout(self, step: Index, pair: Pairs, limit: float, bend: Array) -> Array:
