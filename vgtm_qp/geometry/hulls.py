@@ -1,8 +1,9 @@
-"""Pairs of which at least one body is a convex hull: contacts by FCL, proven by planes, and proofs over a motion.
+"""Pairs of which at least one body is a convex hull: contacts, proven by planes, and proofs over a motion.
 
 A separating plane proves a distance: it is at least the gap between the supporting planes of both bodies along any
-normal. So a contact's distance here is that gap, along the normal that FCL claims. Where FCL's answer and the gap
-disagree, the normal is computed from convex combinations of points of both bodies instead.
+normal. So a contact's distance here is that gap, along the normal that C finds, or that FCL claims where there is no C.
+Where FCL's answer and the gap disagree, the normal is computed from convex combinations of points of both bodies
+instead.
 """
 
 from __future__ import annotations
@@ -212,7 +213,7 @@ class HullGroup(Group):
         for contact in range(1, self.scene.each):
             distance = np.where(near, away, -1.0)
             k = distance.argmax(axis=1)
-            chosen = (distance[every, k] >= SECOND_CONTACT * size).nonzero()[0]
+            chosen = (distance[every, k] > SECOND_CONTACT * size).nonzero()[0]
             if not len(chosen):
                 return
             vertex = k[chosen]

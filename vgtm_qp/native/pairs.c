@@ -484,8 +484,8 @@ static int touch(Pairs *p, const double *ends, const double *piece)
     return call(&p->contact);
 }
 
-/* Take what is known of a hull's vertex or edge beside a piece from the function of axes: at a rim, a search finds no more
-   than half of the digits of a normal, whose square is the error of a distance. */
+/* Take what is known of a hull's vertex or edge beside a piece from the function of axes. At a rim a search finds half of
+   the digits of a normal, whose square is the error of a distance. */
 static int sharpen(const Hulls *h, Pairs *p, const double *piece, const Convex *body, const Convex *other, double *normal,
                    double *gap, Mean *m)
 {

@@ -67,9 +67,9 @@ typedef struct {
     double *places;                        /* (MOST_PIECES + 1, P, 3) */
 
     /* Rows of clearance: their contacts (R, size), numbers of group and pair, in which round they were asked for, 0 in none
-       and -1 for a hull that presses, and body, other and whether that is a body (R, 3); middle and span of the body and of the other body (R, 12), and
-       the answer (R, 7): a distance, a point of the body and one of the other. Counts of rounds, of rows asked for, of
-       answers that were proven, and of rows of hulls that press. */
+       and -1 for a hull that presses, and body, other and whether that is a body (R, 3); middle and span of the body and
+       of the other body (R, 12), and the answer (R, 7): a distance, a point of the body and one of the other. Counts of
+       rounds, of rows asked for, of answers that were proven, and of rows of hulls that press. */
     int room, round, asked_for, proven, unasked;
     double *contacts, *questions, *answers;
     int *group, *pair, *asked, *named;
